@@ -1,0 +1,64 @@
+"""Sampling the ODE dx/dt = v(x, t) from t = 0 to 1, and guidance as a field that wraps one (paper: "Inference")."""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Field = Callable[[Tensor, Tensor], Tensor]
+"""A velocity field: x (batch, T, D) and t (batch,) to dx/dt (batch, T, D)."""
+
+Solver = Literal["euler", "midpoint", "rk4"]
+
+
+def guided(v: Field, correction: Callable[[Tensor], Tensor], weight: float) -> Field:
+    """v(x, t) + lambda u^c(x): the field v, guided by a correction with weight lambda."""
+
+    def field(x: Tensor, t: Tensor) -> Tensor:
+        return v(x, t) + weight * correction(x)
+
+    return field
+
+
+def euler(v: Field, x: Tensor, t: Tensor, h: float) -> Tensor:
+    """One step of order 1, one evaluation."""
+    return x + h * v(x, t)
+
+
+def midpoint(v: Field, x: Tensor, t: Tensor, h: float) -> Tensor:
+    """One step of order 2, two evaluations."""
+    return x + h * v(x + h / 2 * v(x, t), t + h / 2)
+
+
+def rk4(v: Field, x: Tensor, t: Tensor, h: float) -> Tensor:
+    """One step of order 4 (the classical Runge-Kutta method), four evaluations."""
+    k_1 = v(x, t)
+    k_2 = v(x + h / 2 * k_1, t + h / 2)
+    k_3 = v(x + h / 2 * k_2, t + h / 2)
+    k_4 = v(x + h * k_3, t + h)
+    return x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
+
+
+STEPS: dict[Solver, Callable[[Field, Tensor, Tensor, float], Tensor]] = {
+    "euler": euler,
+    "midpoint": midpoint,
+    "rk4": rk4,
+}
+
+
+@torch.no_grad()
+def states(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler") -> Iterator[Tensor]:
+    """The states x_t at t = 0, 1/steps, ..., 1 of the ODE that starts at x_0, `steps` + 1 times (batch, T, D)."""
+    x = x_0
+    yield x
+    for k in range(steps):
+        # k / steps rather than a running sum: the last step ends at t = 1 exactly.
+        x = STEPS[solver](v, x, torch.full_like(x[:, 0, 0], k / steps), 1 / steps)
+        yield x
+
+
+def integrate(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler") -> Tensor:
+    """x_1: where the ODE that starts at x_0 (batch, T, D) arrives at t = 1."""
+    return deque(states(v, x_0, steps, solver), maxlen=1).pop()

@@ -1,0 +1,168 @@
+"""Source distributions p_0 over trajectories (paper: "Constraint-Injected Source Distribution").
+
+Every source is a Gaussian process on the T waypoints, the same for each of the D dimensions, conditioned
+on the values y at some of them (Eq. gp_posterior). Endpoint conditioning is O = {0, T-1}, via-points are
+more indices, and a source conditioned on nothing is O = {}.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+ENDPOINTS = (0, -1)
+LONGEST = 10.0
+"""Largest length scale that a fit returns: straight demonstrations would push it to infinity."""
+
+
+class Source(nn.Module):
+    """x_0 | y ~ N(W y, Sigma), with W = K_:O (K_OO + R)^-1 and Sigma = K - W K_O:.
+
+    Where an observation has no noise, x_0 equals y to the last bit: W's row there is a unit vector and Sigma's
+    factor has a row of zeros.
+
+    Args:
+        K: prior covariance of the waypoints, (T, T); factored once, in float64.
+        index: the conditioned waypoints O, negative ones counted from the end.
+        noise: variance of each observation, R = diag(noise); zero where omitted.
+
+    Raises:
+        ValueError: K is not symmetric positive semi-definite, an index is out of range or given twice, or a
+            variance is negative.
+    """
+
+    index: Tensor
+    mean_map: Tensor
+    covariance: Tensor
+    sampling_map: Tensor
+
+    def __init__(self, K: Tensor, index: Sequence[int] = (), noise: Sequence[float] = ()) -> None:
+        super().__init__()
+        K = K.double()
+        _check_covariance(K)
+        observed, R = _observations(len(K), index, noise)
+        try:
+            W = torch.linalg.solve(K[observed][:, observed] + R.diag(), K[observed]).mT
+        except RuntimeError:
+            raise ValueError(
+                f"conditioned waypoints {list(index)}: expected a covariance that tells them apart"
+            ) from None
+        exact = observed[R == 0]
+        W[exact] = torch.eye(len(observed), dtype=K.dtype)[R == 0]
+        Sigma = K - W @ K[observed]
+        Sigma[exact] = 0
+        Sigma[:, exact] = 0
+        Sigma = (Sigma + Sigma.mT) / 2
+        L = _factor(Sigma, exact)
+        self.register_buffer("index", observed)
+        self.register_buffer("mean_map", W)
+        self.register_buffer("covariance", Sigma)
+        self.register_buffer("sampling_map", torch.cat([W, L], dim=1).to(torch.get_default_dtype()))
+
+    def observe(self, x: Tensor) -> Tensor:
+        """The values y of trajectories x (batch, T, D) at the conditioned waypoints, (batch, O, D)."""
+        return x[:, self.index]
+
+    def mean(self, y: Tensor) -> Tensor:
+        """W y: the mean trajectory given y (batch, O, D), in y's precision, (batch, T, D)."""
+        return self.mean_map.to(y.dtype) @ y
+
+    def sample(self, y: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """x_0 ~ p_0(. | y), one trajectory (T, D) for each row of y (batch, O, D): W y + L z, as one product."""
+        batch, observations, D = y.shape
+        free = self.sampling_map.shape[1] - observations
+        z = torch.randn(batch, D, free, dtype=y.dtype, device=y.device, generator=generator)
+        return (torch.cat([y.mT, z], dim=-1) @ self.sampling_map.mT).mT
+
+
+def rbf(T: int, length_scale: float | Tensor, sigma_f: float | Tensor, epsilon: float) -> Tensor:
+    """K_ij = sigma_f^2 exp(-(s_i - s_j)^2 / (2 l^2)) + epsilon delta_ij with s_i = i / (T - 1), float64 (T, T)."""
+    s = torch.linspace(0, 1, T, dtype=torch.float64)
+    squares = (s[:, None] - s) ** 2
+    return sigma_f**2 * torch.exp(-squares / (2 * length_scale**2)) + epsilon * torch.eye(T, dtype=torch.float64)
+
+
+def gaussian(T: int) -> Source:
+    """The standard normal N(0, I): independent waypoints, conditioned on nothing."""
+    return Source(torch.eye(T))
+
+
+def gp(T: int, length_scale: float = 0.4, sigma_f: float = 1.0, epsilon: float = 1e-6) -> Source:
+    """p_GP: the RBF process, conditioned on nothing."""
+    return Source(rbf(T, length_scale, sigma_f, epsilon))
+
+
+def cgp(T: int, length_scale: float = 0.4, sigma_f: float = 1.0, epsilon: float = 1e-6) -> Source:
+    """p_CGP: the RBF process, conditioned on start and goal (Eq. GP_source_dist)."""
+    return Source(rbf(T, length_scale, sigma_f, epsilon), ENDPOINTS)
+
+
+def fit_rbf(x: Tensor, index: Sequence[int] = (), epsilon: float = 1e-6) -> tuple[float, float]:
+    """Maximum-likelihood (length_scale, sigma_f) of the source conditioned at `index`, for demonstrations x.
+
+    Maximises log p(x_F | x_O), the sum over trajectories and dimensions, F being the waypoints not in O. The
+    data enter through their second moment S = mean x x^T (T, T) alone: with A = (I, -W) the map to residuals,
+    -2 log p = log det Sigma_FF + tr(Sigma_FF^-1 A S A^T) + constant.
+
+    Args:
+        x: demonstrations, (N, T, D).
+        index: the conditioned waypoints O.
+        epsilon: the kernel's, which stays as it is.
+    """
+    N, T, D = x.shape
+    x = x.double()
+    S = torch.einsum("nid,njd->ij", x, x) / (N * D)
+    observed, _ = _observations(T, index, ())
+    free = torch.tensor([i for i in range(T) if i not in observed.tolist()])
+    log_parameters = torch.tensor([0.4, 1.0], dtype=torch.float64).log().requires_grad_()
+    optimizer = torch.optim.LBFGS([log_parameters], max_iter=200, line_search_fn="strong_wolfe")
+
+    def deviance() -> Tensor:
+        optimizer.zero_grad()
+        length_scale, sigma_f = log_parameters.exp()
+        K = rbf(T, length_scale.clamp(max=LONGEST), sigma_f, epsilon)
+        W = torch.linalg.solve(K[observed][:, observed], K[observed][:, free]).mT
+        Sigma = K[free][:, free] - W @ K[observed][:, free]
+        A = torch.zeros(len(free), T, dtype=torch.float64)
+        A[:, free] = torch.eye(len(free), dtype=torch.float64)
+        A = A.index_add(1, observed, -W)
+        L = torch.linalg.cholesky(Sigma)
+        value = 2 * L.diagonal().log().sum() + torch.cholesky_solve(A @ S @ A.mT, L).diagonal().sum()
+        value.backward()
+        return value
+
+    optimizer.step(deviance)
+    fitted: list[float] = log_parameters.detach().exp().tolist()
+    return min(fitted[0], LONGEST), fitted[1]
+
+
+def _check_covariance(K: Tensor) -> None:
+    if not bool(torch.isfinite(K).all()) or not torch.equal(K, K.mT):
+        raise ValueError("covariance: expected a finite symmetric matrix")
+    # Rounding alone makes the smallest eigenvalue of a smooth kernel negative, by some 1e-16 of the trace.
+    if bool((torch.linalg.eigvalsh(K) < -1e-9 * K.diagonal().abs().sum()).any()):
+        raise ValueError("covariance: expected a positive semi-definite matrix")
+
+
+def _observations(T: int, index: Sequence[int], noise: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """The conditioned waypoints as indices in [0, T) and their variances, both (O,)."""
+    if any(not -T <= i < T for i in index):
+        raise ValueError(f"conditioned waypoints {list(index)}: expected indices within the {T} waypoints")
+    observed = torch.tensor([i % T for i in index], dtype=torch.long)
+    if len(observed.unique()) < len(observed):
+        raise ValueError(f"conditioned waypoints {list(index)}: expected each waypoint at most once")
+    R = torch.tensor(list(noise) or [0.0] * len(observed), dtype=torch.float64)
+    if len(R) != len(observed) or not bool((R >= 0).all()):
+        raise ValueError(f"observation noise {list(noise)}: expected {len(observed)} variances of at least 0")
+    return observed, R
+
+
+def _factor(Sigma: Tensor, exact: Tensor) -> Tensor:
+    """L with L L^T = Sigma, and rows of zeros where an observation is exact, (T, T - len(exact))."""
+    free = torch.ones(len(Sigma), dtype=torch.bool)
+    free[exact] = False
+    # Eigenvectors rather than Cholesky: long length scales leave Sigma singular to rounding.
+    variance, U = torch.linalg.eigh(Sigma[free][:, free])
+    L = torch.zeros(len(Sigma), len(variance), dtype=Sigma.dtype)
+    L[free] = U * variance.clamp_min(0).sqrt()
+    return L
