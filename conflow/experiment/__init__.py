@@ -1,0 +1,1 @@
+"""Lightning and MLflow around the method: config, data, training, metrics, tracking, pictures."""

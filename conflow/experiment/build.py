@@ -1,0 +1,55 @@
+"""From settings to the objects of `flow/` and `scene/`: the one place where a name becomes a class."""
+
+import hashlib
+
+import torch
+from torch import Tensor
+
+from conflow.experiment import config
+from conflow.experiment.config import Config
+from conflow.flow import source
+from conflow.flow.correction import Correction, gaussian_filter
+from conflow.flow.source import Source
+from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance
+from conflow.scene.robots import PointRobots
+
+
+def build_source(settings: config.Source, T: int, demonstrations: Tensor | None = None) -> Source:
+    """The source p_0 on T waypoints; with `fit`, its kernel fitted to the demonstrations (N, T, D) where given."""
+    if settings.kind == "gaussian":
+        return source.gaussian(T)
+    length_scale, sigma_f = settings.length_scale, settings.sigma_f
+    index = source.ENDPOINTS if settings.kind == "cgp" else ()
+    if settings.fit and demonstrations is not None:
+        length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.epsilon)
+    return Source(source.rbf(T, length_scale, sigma_f, settings.epsilon), index)
+
+
+def robot_avoidance(settings: Config, D: int) -> Constraint:
+    """The constraint that labels, corrects, guides and judges: robots keep their distance."""
+    return RobotAvoidance(PointRobots(D // 2), settings.constraint.radius, _barrier(settings.constraint))
+
+
+def obstacle_avoidance(settings: Config, D: int) -> Constraint:
+    """The constraint that appears at inference alone: robots, discs of half the touching distance, miss a disc."""
+    return ObstacleAvoidance(
+        PointRobots(D // 2), [settings.sample.obstacle], settings.constraint.radius / 2, _barrier(settings.constraint)
+    )
+
+
+def correction(settings: config.Correction, constraint: Constraint, T: int) -> Correction:
+    """u^c of a constraint, smoothed by the Gaussian filter."""
+    return Correction(constraint, gaussian_filter(T, settings.sigma, settings.width))
+
+
+def random_stream(*key: str | int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator that is a function of what its numbers are for, such as ("batch", seed, step).
+
+    No state is carried from one use to the next, so a run that was interrupted draws what it would have drawn.
+    """
+    digest = hashlib.sha256(repr(key).encode()).digest()
+    return torch.Generator(device).manual_seed(int.from_bytes(digest[:8], "big") >> 1)
+
+
+def _barrier(settings: config.Constraint) -> Barrier:
+    return Barrier(settings.barrier, settings.reduction, settings.gamma)

@@ -1,0 +1,287 @@
+"""The configuration: typed settings, their ranges, and how files and arguments are laid over each other.
+
+OmegaConf stays inside this file. What leaves it is a frozen `Config`; every default stands in `conf/base.yaml`.
+"""
+
+import dataclasses
+import difflib
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from conflow.flow.sampler import Solver
+from conflow.scene.constraint import BarrierShape, Obstacle, Reduction
+
+CONF = Path(__file__).parents[2] / "conf"
+
+SourceKind = Literal["gaussian", "gp", "cgp"]
+Schedule = Literal["constant", "one_cycle"]
+Tree = dict[str, Any]
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used: its name, its value and what was expected, in one line."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values that a numeric setting may take: [low, high], or (above, high]."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: float = -math.inf
+
+    def __contains__(self, value: float) -> bool:
+        return math.isfinite(value) and self.low <= value <= self.high and value > self.above
+
+    def __str__(self) -> str:
+        bounds = {"above": self.above, "of at least": self.low, "at most": self.high}
+        return " and ".join(f"{word} {bound:.16g}" for word, bound in bounds.items() if math.isfinite(bound))
+
+
+Positive = Annotated[float, Range(above=0)]
+Weight = Annotated[float, Range(0)]
+Count = Annotated[int, Range(1, 10**9)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+Fraction = Annotated[float, Range(above=0, high=1)]
+
+
+@dataclass(frozen=True)
+class Data:
+    path: str | None
+    num: Annotated[int, Range(10, 10**8)]
+    horizon: Annotated[int, Range(3, 4096)]
+    amplitudes: Annotated[list[float], Range(0, 1)]
+    jitter: Annotated[float, Range(0, 0.2)]
+    seed: Seed
+    negatives: bool
+    val_fraction: Fraction
+    test_fraction: Fraction
+
+
+@dataclass(frozen=True)
+class Source:
+    kind: SourceKind
+    length_scale: Positive
+    sigma_f: Positive
+    epsilon: Positive
+    fit: bool
+
+
+@dataclass(frozen=True)
+class Constraint:
+    radius: Annotated[float, Range(above=0, high=2)]
+    barrier: BarrierShape
+    gamma: Positive
+    reduction: Reduction
+
+
+@dataclass(frozen=True)
+class Correction:
+    lambda_c: Weight
+    sigma: Positive
+    width: Count
+
+
+@dataclass(frozen=True)
+class Network:
+    hidden: Annotated[int, Range(1, 65536)]
+    blocks: Annotated[int, Range(0, 1024)]
+
+
+@dataclass(frozen=True)
+class Train:
+    max_steps: Count
+    batch_size: Count
+    lr: Positive
+    schedule: Schedule
+    clip: Positive
+    log_every: Count
+    val_every: Count
+
+
+@dataclass(frozen=True)
+class Sample:
+    num: Annotated[int, Range(2)]
+    solver: Solver
+    steps: Count
+    robot_weight: Weight
+    obstacle_weight: Weight
+    obstacle: Obstacle
+
+
+@dataclass(frozen=True)
+class Config:
+    """One experiment. The comments of `conf/base.yaml` say what each setting is."""
+
+    ablation: str
+    preset: str
+    seed: Seed
+    data: Data
+    source: Source
+    constraint: Constraint
+    correction: Correction
+    network: Network
+    train: Train
+    sample: Sample
+
+    def tree(self) -> Tree:
+        """The whole as nested dictionaries of plain values."""
+        return dataclasses.asdict(self)
+
+    def sha(self) -> str:
+        """A fingerprint of all settings, 16 hexadecimal digits."""
+        return hashlib.sha256(yaml.safe_dump(self.tree()).encode()).hexdigest()[:16]
+
+
+def names(axis: str) -> list[str]:
+    """The ablations or presets that exist: the files under conf/<axis>/."""
+    return sorted(file.stem for file in (CONF / axis).glob("*.yaml"))
+
+
+def load(arguments: Sequence[str] = ()) -> Config:
+    """conf/base.yaml, then the preset, then the ablation, then arguments `key=value`, checked.
+
+    Raises:
+        ConfigError: an unknown name, a value of the wrong type or out of range.
+    """
+    pairs = [_split(argument) for argument in arguments]
+    base = _read("base")
+    chosen = {axis: str(dict(pairs).get(axis, base[axis])) for axis in ("preset", "ablation")}
+    layers = [base]
+    for axis, name in chosen.items():
+        if name not in names(axis):
+            raise ConfigError(f"{axis}={name}: expected one of {', '.join(names(axis))}{_nearest(name, names(axis))}")
+        layers.append(_read(f"{axis}/{name}"))
+    settings = _schema(Config)
+    for key, value in [leaf for layer in layers for leaf in flatten(layer).items()] + pairs:
+        _set(settings, key, value)
+    return from_tree(OmegaConf.to_container(settings))
+
+
+def from_tree(tree: Any) -> Config:
+    """The Config that `Config.tree` wrote, checked again.
+
+    Raises:
+        ConfigError: as `load`; also where a setting is missing.
+    """
+    settings = _schema(Config)
+    for key, value in flatten(tree).items():
+        _set(settings, key, value)
+    missing = sorted(OmegaConf.missing_keys(settings))
+    if missing:
+        raise ConfigError(f"{missing[0]}: expected a value, found none")
+    config = OmegaConf.to_object(settings)
+    assert isinstance(config, Config)
+    _check(config)
+    return config
+
+
+def flatten(tree: Tree, prefix: str = "") -> Tree:
+    """Nested settings as one dictionary with dotted keys."""
+    flat: Tree = {}
+    for name, value in tree.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _fields(cls: type = Config, prefix: str = "") -> Iterator[tuple[str, Any, Range]]:
+    """Every setting's dotted key, type and range."""
+    for name, annotation in get_type_hints(cls, include_extras=True).items():
+        kind, allowed = get_args(annotation) if get_origin(annotation) is Annotated else (annotation, Range())
+        if dataclasses.is_dataclass(kind):
+            yield from _fields(cast(type, kind), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", kind, allowed
+
+
+def _schema(cls: type) -> Any:
+    """The typed tree with every setting missing; open for writing although the dataclasses are frozen."""
+    node = OmegaConf.structured(cls)
+    OmegaConf.set_readonly(node, False)
+    for name, kind in get_type_hints(cls).items():
+        if dataclasses.is_dataclass(kind):
+            node[name] = _schema(cast(type, kind))
+    return node
+
+
+def _read(name: str) -> Tree:
+    try:
+        tree = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"conf/{name}.yaml: {' '.join(str(error).split())}") from None
+    if not isinstance(tree, dict):
+        raise ConfigError(f"conf/{name}.yaml: expected settings, found {tree!r}")
+    return tree
+
+
+def _split(argument: str) -> tuple[str, str]:
+    key, equals, value = argument.partition("=")
+    if not equals:
+        raise ConfigError(f"{argument}: expected key=value")
+    return key.strip(), value.strip()
+
+
+def _nearest(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _set(settings: Any, key: str, value: Any) -> None:
+    """Set one key to a value, or to the value that an argument's text means for a setting of its type."""
+    types = {name: kind for name, kind, _ in _fields()}
+    if key not in types:
+        raise ConfigError(f"{key}: no such setting{_nearest(key, list(types))}")
+    try:
+        parsed = _parse(value, types[key]) if isinstance(value, str) else value
+        OmegaConf.update(settings, key, parsed, merge=False)
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OverflowError):
+        raise ConfigError(f"{key}={value}: expected {_describe(types[key])}") from None
+
+
+def _parse(text: str, kind: Any) -> Any:
+    """Text is itself where text is wanted: YAML would turn a name such as `on` into a truth value."""
+    if kind is str or get_origin(kind) is Literal:
+        return text
+    if kind == str | None:
+        return None if text in ("", "null") else text
+    return yaml.safe_load(text)
+
+
+def _describe(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return "one of " + ", ".join(get_args(kind))
+    words = {
+        int: "a whole number",
+        float: "a finite number",
+        bool: "true or false",
+        str: "a name",
+        list[float]: "[a, b, ...]",
+    }
+    return words.get(kind, "a text or null")
+
+
+def _check(config: Config) -> None:
+    values = flatten(config.tree())
+    for key, kind, allowed in _fields():
+        for value in values[key] if isinstance(values[key], list) else [values[key]]:
+            if isinstance(value, int | float) and value not in allowed:
+                raise ConfigError(f"{key}={values[key]}: expected {_describe(kind)} {allowed}")
+    if not config.data.amplitudes:
+        raise ConfigError("data.amplitudes=[]: expected at least one amplitude")
+    if config.correction.width % 2 == 0:
+        raise ConfigError(f"correction.width={config.correction.width}: expected an odd number of taps")
+    if config.data.val_fraction + config.data.test_fraction >= 1:
+        raise ConfigError(
+            f"data.test_fraction={config.data.test_fraction}: expected less than 1 together with "
+            f"data.val_fraction={config.data.val_fraction}"
+        )
+    if config.source.fit and config.source.kind == "gaussian":
+        raise ConfigError("source.fit=True: expected source.kind gp or cgp, the standard normal has nothing to fit")

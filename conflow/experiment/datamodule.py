@@ -1,0 +1,117 @@
+"""Demonstrations for training and evaluation: generated or read, labelled, split, and served in whole batches."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, TensorDataset
+
+from conflow.experiment.build import random_stream, robot_avoidance
+from conflow.experiment.config import Config
+from conflow.scene import trajectories
+from conflow.scene.trajectories import DemonstrationError
+
+
+class Split(NamedTuple):
+    """Trajectories x_1 (N, T, D) and whether they violate the constraint, M (N,)."""
+
+    x: Tensor
+    violates: Tensor
+
+    def feasible(self) -> "Split":
+        """D+ alone."""
+        return Split(self.x[~self.violates], self.violates[~self.violates])
+
+
+class Batches:
+    """x_1 ~ q(x_1): `steps` whole batches drawn by index from memory, each a function of (seed, step) alone.
+
+    Iteration starts after `step` batches, which `state_dict` remembers.
+    """
+
+    def __init__(self, split: Split, batch_size: int, steps: int, seed: int) -> None:
+        self.split, self.batch_size, self.steps, self.seed = split, batch_size, steps, seed
+        self.step = 0
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        x, violates = self.split
+        for step in range(self.step, self.steps):
+            i = torch.randint(len(x), (self.batch_size,), generator=random_stream("batch", self.seed, step))
+            i = i.to(x.device)
+            self.step = step + 1
+            yield x[i], violates[i]
+
+    def state_dict(self) -> dict[str, int]:
+        return {"step": self.step}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.step = state["step"]
+
+
+class DemonstrationData(LightningDataModule):
+    """The demonstrations of one experiment.
+
+    `train` and `val` hold D+ and D-, or D+ alone where `data.negatives` is false. `test` always holds both: its
+    trajectories only lend their starts and goals to the samples, so every ablation is asked the same questions.
+    `train` keeps no trajectory of `val` or `test`.
+
+    Attributes:
+        x, violates: all demonstrations and their labels M.
+        digest: fingerprint of x.
+
+    Raises:
+        DemonstrationError: the demonstrations cannot be used, or a class that the ablation needs is missing.
+    """
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = config
+        name, (x, violates) = self._demonstrations()
+        trajectories.check(x, name)
+        self.x = x
+        self.T, self.D = x.shape[1:]
+        self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
+        self.digest = trajectories.digest(x)
+        self.train, self.val, self.test = self._split(name)
+
+    def _demonstrations(self) -> tuple[str, trajectories.Demonstrations]:
+        data = self.config.data
+        if data.path is not None:
+            return f"data.path={data.path}", trajectories.load(data.path)
+        x = trajectories.swap(data.num, data.horizon, data.amplitudes, data.jitter, data.seed)
+        return "generated demonstrations", trajectories.Demonstrations(x, None)
+
+    def _split(self, name: str) -> tuple[Split, Split, Split]:
+        data = self.config.data
+        order = torch.randperm(len(self.x), generator=random_stream("split", data.seed))
+        val, test = round(data.val_fraction * len(order)), round(data.test_fraction * len(order))
+        parts = torch.split(order, [len(order) - val - test, val, test])
+        train_split, val_split, test_split = (Split(self.x[i], self.violates[i]) for i in parts)
+        if data.negatives:
+            if not bool(train_split.violates.any()):
+                raise DemonstrationError(
+                    f"{name}: no trajectory for training violates the constraint, and ablation "
+                    f"{self.config.ablation} needs D-"
+                )
+        else:
+            train_split, val_split = train_split.feasible(), val_split.feasible()
+        for part, split in {"training": train_split, "validation": val_split, "test": test_split}.items():
+            if not len(split.x):
+                raise DemonstrationError(f"{name}: no trajectory is left for {part} out of {len(self.x)}")
+        return train_split, val_split, test_split
+
+    def train_dataloader(self) -> Batches:
+        train = self.config.train
+        # The data move to the accelerator once, not batch by batch.
+        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        split = Split(self.train.x.to(device), self.train.violates.to(device))
+        return Batches(split, train.batch_size, train.max_steps, self.config.seed)
+
+    def val_dataloader(self) -> DataLoader[tuple[Tensor, ...]]:
+        """The whole of `val` as one batch."""
+        return DataLoader(TensorDataset(*self.val), batch_size=None, sampler=[slice(None)])

@@ -1,0 +1,91 @@
+"""ConFlow as a LightningModule: Algorithm 1 of the paper, and sampling from what it trained."""
+
+from typing import Any, Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from lightning import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from torch import Tensor, nn
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
+
+from conflow.experiment import config
+from conflow.experiment.build import build_source, correction, obstacle_avoidance, random_stream, robot_avoidance
+from conflow.experiment.config import Config
+from conflow.flow.network import ResMLP
+from conflow.flow.path import interpolate, velocity
+from conflow.flow.sampler import Field, guided, integrate
+
+Setting = Literal["none", "robot", "obstacle"]
+SETTINGS: tuple[Setting, ...] = get_args(Setting)
+"""The paper's three inference settings: without guidance, guided around the other robot, around an obstacle."""
+
+
+class ConFlow(LightningModule):
+    """Constraint-guided flow matching.
+
+    Args:
+        config: the experiment.
+        T, D: waypoints and dimensions of a trajectory.
+        demonstrations: D+ (N, T, D), to which the source's kernel is fitted where `source.fit` asks for it.
+    """
+
+    def __init__(self, config: Config, T: int, D: int, demonstrations: Tensor | None = None) -> None:
+        super().__init__()
+        self.config, self.T, self.D = config, T, D
+        self.source = build_source(config.source, T, demonstrations)
+        self.v = ResMLP(T, D, config.network.hidden, config.network.blocks)
+        self.robots, self.obstacle = robot_avoidance(config, D), obstacle_avoidance(config, D)
+        self.u_c = correction(config.correction, self.robots, T)
+        self.u_c_obstacle = correction(config.correction, self.obstacle, T)
+        self.grad_norm = torch.zeros(())
+
+    def training_step(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
+        return self.loss(*batch, random_stream("training", self.config.seed, step, device=self.device))
+
+    def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        # The same draws at every validation, so that val/loss moves with the network alone.
+        noise = random_stream("validation", self.config.seed, device=self.device)
+        self.log("val/loss", self.loss(*batch, noise), batch_size=len(batch[0]), logger=False)
+
+    def loss(self, x_1: Tensor, M: Tensor, noise: torch.Generator) -> Tensor:
+        """L_CG (Eq. cg_loss) for demonstrations x_1 (batch, T, D) and their violations M (batch,): Algorithm 1."""
+        lambda_c = self.config.correction.lambda_c
+        x_0 = self.source.sample(self.source.observe(x_1), noise)
+        t = torch.rand(len(x_1), device=x_1.device, generator=noise)
+        x_t = interpolate(x_0, x_1, t)
+        u_c = self.u_c(x_t)
+        u_t = velocity(x_0, x_1) + lambda_c * M[:, None, None] * u_c
+        return F.mse_loss(self.v(x_t, t), u_t)
+
+    def field(self, setting: Setting, sample: config.Sample | None = None) -> Field:
+        """The velocity field that a setting samples from."""
+        sample = sample or self.config.sample
+        if setting == "robot":
+            return guided(self.v, self.u_c, sample.robot_weight)
+        if setting == "obstacle":
+            return guided(self.v, self.u_c_obstacle, sample.obstacle_weight)
+        return self.v
+
+    def sample(self, y: Tensor, setting: Setting = "none", noise: torch.Generator | None = None) -> Tensor:
+        """Trajectories (batch, T, D), one for each observation y (batch, O, D) of the source (`source.observe`)."""
+        x_0 = self.source.sample(y, noise)
+        return integrate(self.field(setting), x_0, self.config.sample.steps, self.config.sample.solver)
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        train = self.config.train
+        optimizer = AdamW(self.v.parameters(), lr=train.lr, fused=True)
+        schedule: LRScheduler = (
+            OneCycleLR(optimizer, train.lr, total_steps=train.max_steps)
+            if train.schedule == "one_cycle"
+            else LambdaLR(optimizer, lambda step: 1.0)
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_gradient_clipping(self, optimizer: Optimizer, *_: Any, **__: Any) -> None:
+        """Clips as the Trainer would, and keeps the norm that clipping computes anyway."""
+        self.grad_norm = nn.utils.clip_grad_norm_(self.v.parameters(), self.config.train.clip)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["conflow"] = {"config": self.config.tree(), "T": self.T, "D": self.D}

@@ -1,0 +1,33 @@
+"""Tables of results."""
+
+from rich.table import Table
+
+from conflow.experiment.callbacks import Results
+
+ROWS = {
+    "robot_collision_rate": "robot-collision rate",
+    "object_collision_rate": "object-collision rate",
+    "smoothness_median": "smoothness, median",
+    "smoothness_p95": "smoothness, 95th percentile",
+    "start_error": "start error per robot",
+    "end_error": "end error per robot",
+    "diversity": "diversity",
+}
+
+
+def results_table(results: Results, title: str) -> Table:
+    """The test metrics of one run, a column for each setting, each with its 95 % interval."""
+    num = int(next(iter(results.values()))["num"])
+    table = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
+    table.add_column("metric")
+    for setting in results:
+        table.add_column(setting, justify="right")
+    for key, label in ROWS.items():
+        table.add_row(label, *(_estimate(metrics, key) for metrics in results.values()))
+    table.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
+    return table
+
+
+def _estimate(metrics: dict[str, float], key: str) -> str:
+    stem = key.removesuffix("_rate")
+    return f"{metrics[key]:.4f}\n[dim]\\[{metrics[f'{stem}_low']:.4f}, {metrics[f'{stem}_high']:.4f}][/dim]"

@@ -1,0 +1,36 @@
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from conflow.experiment import config
+from conflow.experiment.config import Config
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose runs/ the commands of all tests share: a new store takes seconds to make."""
+    return tmp_path_factory.mktemp("workplace")
+
+
+@pytest.fixture(scope="session")
+def conflow(workplace: Path) -> Command:
+    """Run the command line in the workplace, as a user would."""
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
+        command = [sys.executable, "-m", "conflow", *arguments]
+        return subprocess.run(command, cwd=workplace, env=environment, capture_output=True, text=True, timeout=300)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def smoke() -> Config:
+    """The smallest experiment."""
+    return config.load(["preset=smoke"])

@@ -1,0 +1,106 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from conflow.experiment import config
+from conflow.experiment.config import Config
+from conflow.experiment.datamodule import Batches, DemonstrationData, Split
+from conflow.scene.trajectories import DemonstrationError, swap
+
+
+def rows(split: Split) -> set[bytes]:
+    return {x.numpy().tobytes() for x in split.x}
+
+
+def on_file(settings: Config, path: Path, **arrays: np.ndarray) -> Config:
+    np.savez(path, allow_pickle=False, **arrays)
+    return dataclasses.replace(settings, data=dataclasses.replace(settings.data, path=str(path)))
+
+
+def test_the_splits_share_no_trajectory_and_lose_none(smoke: Config) -> None:
+    data = DemonstrationData(smoke)
+    train, val, test = rows(data.train), rows(data.val), rows(data.test)
+    assert len(train | val | test) == len(train) + len(val) + len(test) == smoke.data.num
+
+
+def test_the_split_depends_on_the_datas_seed_and_not_on_the_runs() -> None:
+    one, same, other = (
+        DemonstrationData(config.load(["preset=smoke", *arguments])).test.x
+        for arguments in ((), ("seed=1",), ("data.seed=1",))
+    )
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)
+
+
+def test_labels_are_collisions_closer_than_the_radius(smoke: Config) -> None:
+    data = DemonstrationData(smoke)
+    distance = (data.x[:, :, :2] - data.x[:, :, 2:]).norm(dim=2).amin(dim=1)
+    assert torch.equal(data.violates, distance < 0.3)
+
+
+def test_without_negatives_training_and_validation_see_feasible_demonstrations_alone() -> None:
+    mixed, feasible = (DemonstrationData(config.load(["preset=smoke", f"ablation={a}"])) for a in ("cgp", "fm"))
+    assert mixed.train.violates.any()
+    assert not feasible.train.violates.any()
+    assert not feasible.val.violates.any()
+    assert rows(feasible.train) == rows(mixed.train.feasible())
+    # Every ablation answers the same test starts and goals.
+    assert torch.equal(feasible.test.x, mixed.test.x)
+
+
+def test_batches_are_a_function_of_seed_and_step_and_resume_where_they_stopped(smoke: Config) -> None:
+    split = DemonstrationData(smoke).train
+    whole = [x for x, _ in Batches(split, 16, 6, seed=3)]
+    stopped = Batches(split, 16, 6, seed=3)
+    stream = iter(stopped)
+    head = [next(stream)[0] for _ in range(4)]
+    resumed = Batches(split, 16, 6, seed=3)
+    resumed.load_state_dict(stopped.state_dict())
+    tail = [x for x, _ in resumed]
+    assert all(torch.equal(a, b) for a, b in zip(whole, head + tail, strict=True))
+    assert not torch.equal(whole[0], next(iter(Batches(split, 16, 6, seed=4)))[0])
+
+
+def test_batches_draw_trajectories_with_their_own_labels_and_reach_all_of_them(smoke: Config) -> None:
+    split = DemonstrationData(smoke).train
+    label = {x.numpy().tobytes(): bool(m) for x, m in zip(*split, strict=True)}
+    seen = set()
+    for x, violates in Batches(split, 400, 20, seed=0):
+        seen |= {row.numpy().tobytes() for row in x}
+        assert [label[row.numpy().tobytes()] for row in x] == violates.tolist()
+    assert seen == set(label)  # a given one of 400 is missed by 8,000 draws with probability e^-20
+
+
+def test_a_users_file_is_read_labelled_and_split(smoke: Config, tmp_path: Path) -> None:
+    x = swap(200, T=20, seed=7).numpy()
+    data = DemonstrationData(on_file(smoke, tmp_path / "mine.npz", x=x))
+    assert np.array_equal(data.x.numpy(), x)
+    assert (data.T, data.D) == (20, 4)
+    assert 0 < data.violates.float().mean() < 1
+
+
+def test_a_users_labels_are_kept(smoke: Config, tmp_path: Path) -> None:
+    labels = np.arange(200) % 2 == 0
+    data = DemonstrationData(on_file(smoke, tmp_path / "mine.npz", x=swap(200).numpy(), violates=labels))
+    assert np.array_equal(data.violates.numpy(), labels)
+
+
+@pytest.mark.parametrize(("ablation", "violates", "said"), [("cgp", False, "needs D-"), ("fm", True, "no trajectory")])
+def test_a_class_that_the_ablation_needs_and_the_file_lacks_is_named(
+    ablation: str, violates: bool, said: str, tmp_path: Path
+) -> None:
+    settings = config.load(["preset=smoke", f"ablation={ablation}"])
+    labels = np.full(100, violates)
+    with pytest.raises(DemonstrationError, match=said) as refused:
+        DemonstrationData(on_file(settings, tmp_path / "one.npz", x=swap(100).numpy(), violates=labels))
+    assert "one.npz" in str(refused.value)
+
+
+def test_a_trajectory_outside_the_workspace_is_refused_by_number(smoke: Config, tmp_path: Path) -> None:
+    x = swap(50).numpy()
+    x[17, 3, 1] = 1.5
+    with pytest.raises(DemonstrationError, match=r"1 trajectories leave the workspace \[-1, 1\], the first is 17"):
+        DemonstrationData(on_file(smoke, tmp_path / "far.npz", x=x))

@@ -1,0 +1,120 @@
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from conflow.experiment import config
+from conflow.experiment.build import random_stream
+from conflow.experiment.metrics import smoothness
+from conflow.experiment.module import SETTINGS, ConFlow
+from conflow.flow.sampler import integrate
+from conflow.scene.trajectories import swap
+
+
+def model(*arguments: str) -> ConFlow:
+    torch.manual_seed(0)
+    return ConFlow(config.load(["preset=smoke", *arguments]), 32, 4)
+
+
+def closest(x: Tensor) -> Tensor:
+    return (x[..., :2] - x[..., 2:]).norm(dim=-1).amin(dim=1)
+
+
+def noise() -> torch.Generator:
+    return random_stream("test", 0)
+
+
+def test_where_nothing_violates_the_guided_loss_is_that_of_flow_matching() -> None:
+    x_1, feasible = swap(200), torch.zeros(200, dtype=torch.bool)
+    guided, plain = model("correction.lambda_c=2.5"), model("correction.lambda_c=0")
+    plain.load_state_dict(guided.state_dict())
+    assert torch.equal(guided.loss(x_1, feasible, noise()), plain.loss(x_1, feasible, noise()))
+    assert not torch.equal(guided.loss(x_1, ~feasible, noise()), plain.loss(x_1, ~feasible, noise()))
+
+
+@pytest.mark.parametrize("reduction", ["waypoint", "closest"])
+def test_the_loss_is_algorithm_1_written_out(reduction: str) -> None:
+    """Gradient by autograd, smoothing by a convolution, conditioning left to the tested source."""
+    flow = model(f"constraint.reduction={reduction}")
+    x_1 = swap(300)
+    M = closest(x_1) < 0.3
+    draws = noise()
+    x_0 = flow.source.sample(x_1[:, [0, -1]], draws)
+    t = torch.rand(300, generator=draws)[:, None, None]
+    x_t = ((1 - t) * x_0 + t * x_1).requires_grad_()
+    d = (x_t[..., :2] - x_t[..., 2:]).norm(dim=-1)
+    d = d if reduction == "waypoint" else d.amin(dim=1, keepdim=True)
+    C = -torch.log(1 + torch.exp(-10 * (d - 0.3))) / 10
+    (g,) = torch.autograd.grad(C.sum(), x_t)
+    w = torch.exp(-(torch.arange(-4.0, 5.0) ** 2) / (2 * 5.0**2))
+    u_c = F.conv1d(g.mT.reshape(-1, 1, 32), (w / w.sum()).view(1, 1, 9), padding=4).view(300, 4, 32).mT
+    target = x_1 - x_0 + 2.5 * M[:, None, None] * u_c
+    expected = ((flow.v(x_t, t.flatten()) - target) ** 2).mean()
+    # Single precision, and exp and log instead of softplus.
+    assert flow.loss(x_1, M, noise()).item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_a_training_step_is_a_function_of_seed_step_and_batch() -> None:
+    flow, batch = model(), (swap(64), torch.ones(64, dtype=torch.bool))
+    torch.manual_seed(1)
+    first = flow.training_step(batch, 5)
+    torch.manual_seed(2)
+    assert torch.equal(first, flow.training_step(batch, 5))
+    assert not torch.equal(first, flow.training_step(batch, 6))
+    assert not torch.equal(first, model("seed=1").training_step(batch, 5))
+
+
+def test_without_guidance_a_sample_is_the_flow_of_the_network_alone() -> None:
+    flow = model()
+    y = flow.source.observe(swap(20))
+    expected = integrate(flow.v, flow.source.sample(y, noise()), 10, "euler")
+    assert torch.equal(flow.sample(y, "none", noise()), expected)
+
+
+def test_guidance_moves_samples_away_from_what_it_avoids_and_in_proportion_to_its_weight() -> None:
+    y = swap(400)[:, [0, -1]]
+    base, strong = model(), model("sample.robot_weight=3", "sample.obstacle_weight=3")
+    for flow in (base, strong):
+        torch.nn.init.zeros_(flow.v.outlet.weight)  # a field that stands still leaves guidance alone
+        torch.nn.init.zeros_(flow.v.outlet.bias)
+    clearance = {
+        name: [
+            flow.robots.clearance(flow.sample(y, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
+        ]
+        for name, flow in (("base", base), ("strong", strong))
+    }
+    none, robot, _ = clearance["base"]
+    assert none < robot < clearance["strong"][1]
+    obstacle = [
+        base.obstacle.clearance(base.sample(y, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
+    ]
+    assert obstacle[2] > obstacle[0]
+
+
+def test_samples_start_as_smooth_as_the_source() -> None:
+    gaussian, cgp = (model(f"source.kind={kind}") for kind in ("gaussian", "cgp"))
+    x = swap(100)
+    rough, smooth = (smoothness(flow.source.sample(flow.source.observe(x), noise())).mean() for flow in (gaussian, cgp))
+    assert smooth < 0.1 * rough
+
+
+def test_a_fitted_kernel_comes_from_the_demonstrations_and_survives_reloading() -> None:
+    settings = config.load(["preset=smoke", "source.fit=true"])
+    x = swap(200)
+    fitted, fresh = ConFlow(settings, 32, 4, x), ConFlow(settings, 32, 4)
+    y = fitted.source.observe(x)
+    assert not torch.equal(fitted.source.covariance, fresh.source.covariance)
+    fresh.load_state_dict(fitted.state_dict())
+    assert torch.equal(fitted.sample(y, "none", noise()), fresh.sample(y, "none", noise()))
+
+
+def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("autograd on the sampling path")
+
+    flow = model()
+    y = flow.source.observe(swap(8))
+    monkeypatch.setattr(torch.autograd, "grad", forbidden)
+    monkeypatch.setattr(torch.autograd, "backward", forbidden)
+    for setting in SETTINGS:
+        assert not flow.sample(y, setting, noise()).requires_grad

@@ -1,0 +1,71 @@
+import shutil
+from pathlib import Path
+
+import pytest
+from mlflow.artifacts import list_artifacts
+
+from conflow.experiment import config, tracking
+from conflow.experiment.datamodule import DemonstrationData
+
+
+@pytest.fixture
+def store_folder(tmp_path: Path, workplace: Path, conflow: object, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of its own with an empty store."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    folder = tmp_path / "before"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_artifacts_are_found_again_after_the_folder_has_moved(
+    store_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = config.load(["preset=smoke"])
+    with tracking.start(settings, DemonstrationData(settings)) as logger:
+        run_id = str(logger.run_id)
+    after = store_folder.parent / "after it has moved"
+    shutil.move(store_folder, after)
+    monkeypatch.chdir(after)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # which MLflow sets within a process
+    uri = tracking.client().get_run(run_id).info.artifact_uri
+    assert uri is not None
+    # By its address: within one process MLflow remembers where a run's artifacts were.
+    assert [Path(artifact.path).name for artifact in list_artifacts(artifact_uri=uri)] == ["config.yaml"]
+    assert uri.startswith((after / "runs" / "artifacts").as_uri())
+
+
+def test_metrics_are_written_in_batches_and_none_is_lost(store_folder: Path) -> None:
+    settings = config.load(["preset=smoke"])
+    with tracking.start(settings, DemonstrationData(settings)) as logger:
+        written: list[int] = []
+        log_batch = logger.store.log_batch
+
+        def counted(run_id: str, **entities: list[object]) -> None:
+            written.append(len(entities["metrics"]))
+            log_batch(run_id, **entities)  # type: ignore[arg-type]
+
+        logger.store.log_batch = counted  # type: ignore[method-assign, assignment]
+        for step in range(2500):
+            logger.log_metrics({"train/loss": 1 / (step + 1)}, step)
+    assert sum(written) == 2500
+    assert len(written) <= 4  # 1,000 in a batch; one more if five seconds have passed
+    history = logger.store.get_metric_history(str(logger.run_id), "train/loss")
+    assert [metric.step for metric in history] == list(range(2500))
+
+
+def test_a_run_that_raises_is_failed_and_keeps_its_metrics(store_folder: Path) -> None:
+    settings = config.load(["preset=smoke"])
+
+    def fail() -> None:
+        with tracking.start(settings, DemonstrationData(settings)) as logger:
+            ids.append(str(logger.run_id))
+            logger.log_metrics({"train/loss": 0.5}, 1)
+            raise RuntimeError("deliberately")
+
+    ids: list[str] = []
+    with pytest.raises(RuntimeError, match="deliberately"):
+        fail()
+    run = tracking.client().get_run(ids[0])
+    assert run.info.status == "FAILED"
+    assert run.data.metrics["train/loss"] == 0.5

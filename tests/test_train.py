@@ -1,0 +1,175 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from mlflow import MlflowClient
+from mlflow.entities import Run
+
+from conflow.experiment import config
+from conflow.experiment.build import random_stream
+from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.metrics import trajectory_metrics
+from conflow.experiment.module import SETTINGS
+from conflow.experiment.train import load_model
+from tests.conftest import Command
+
+SETTINGS_ARGUMENTS = ["preset=smoke", "seed=3"]
+
+
+def store(workplace: Path) -> MlflowClient:
+    return MlflowClient(f"sqlite:///{workplace / 'runs' / 'mlflow.db'}")
+
+
+def runs(workplace: Path) -> list[Run]:
+    """All runs, the newest first."""
+    client = store(workplace)
+    experiment = client.get_experiment_by_name("conflow")
+    assert experiment is not None
+    return list(client.search_runs([experiment.experiment_id], order_by=["attributes.start_time DESC"]))
+
+
+@pytest.fixture(scope="module")
+def trained(conflow: Command, workplace: Path) -> tuple[Run, str]:
+    """A finished run, and what its command printed."""
+    result = conflow("train", *SETTINGS_ARGUMENTS)
+    assert result.returncode == 0, result.stderr
+    return runs(workplace)[0], result.stdout
+
+
+def artifacts(run: Run) -> Path:
+    assert run.info.artifact_uri is not None
+    return Path(run.info.artifact_uri.removeprefix("file://"))
+
+
+def test_a_run_is_finished_named_tagged_and_has_every_setting(trained: tuple[Run, str]) -> None:
+    run, _ = trained
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == "cgp-s3"
+    settings = config.load(SETTINGS_ARGUMENTS)
+    assert {key: run.data.tags[key] for key in ("ablation", "preset", "seed", "config_sha")} == {
+        "ablation": "cgp",
+        "preset": "smoke",
+        "seed": "3",
+        "config_sha": settings.sha(),
+    }
+    assert {"git_sha", "git_dirty", "host"} <= set(run.data.tags)
+    assert run.data.params == {key: str(value) for key, value in config.flatten(settings.tree()).items()}
+    assert config.from_tree(yaml.safe_load((artifacts(run) / "config.yaml").read_text())) == settings
+
+
+def test_a_run_holds_the_documented_metrics(trained: tuple[Run, str]) -> None:
+    run, _ = trained
+    expected = {"train/loss", "train/grad_norm", "train/steps_per_second", "val/loss"}
+    for setting in SETTINGS:
+        for metric in ("robot_collision", "object_collision"):
+            expected |= {f"test/{setting}/{metric}_{part}" for part in ("rate", "low", "high", "count")}
+        for metric in ("smoothness_median", "smoothness_p95", "start_error", "end_error", "diversity"):
+            expected |= {f"test/{setting}/{metric}{part}" for part in ("", "_low", "_high")}
+        expected |= {f"test/{setting}/latency_ms", f"test/{setting}/num"}
+    assert expected <= set(run.data.metrics)
+
+
+def test_metrics_are_logged_by_step(trained: tuple[Run, str], workplace: Path) -> None:
+    run, _ = trained
+    for key, steps in {"train/loss": [10, 20, 30, 40], "val/loss": [20, 40], "test/none/num": [40]}.items():
+        assert [metric.step for metric in store(workplace).get_metric_history(run.info.run_id, key)] == steps
+
+
+def test_the_data_set_is_an_input_with_its_digest(trained: tuple[Run, str]) -> None:
+    run, _ = trained
+    data = DemonstrationData(config.load(SETTINGS_ARGUMENTS))
+    assert run.inputs is not None
+    assert [entry.dataset.digest for entry in run.inputs.dataset_inputs] == [data.digest]
+
+
+def test_the_pictures_are_there(trained: tuple[Run, str]) -> None:
+    run, _ = trained
+    for name in ("page", "demonstrations", "sources"):
+        assert (artifacts(run) / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_closes_with_the_metrics_and_the_way_to_the_pages(trained: tuple[Run, str]) -> None:
+    run, output = trained
+    assert f"{run.data.metrics['test/none/robot_collision_rate']:.4f}" in output
+    assert "make ui" in output.splitlines()[-1]
+
+
+def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Run, str]) -> None:
+    run, _ = trained
+    model = load_model(artifacts(run) / "model.ckpt")
+    x_1 = DemonstrationData(model.config).test.x[torch.arange(64) % 50]
+    for setting in SETTINGS:
+        x = model.sample(model.source.observe(x_1), setting, random_stream("test samples", 3, setting))
+        metrics = trajectory_metrics(model.robots, model.obstacle)
+        metrics.update(x=x, x_1=x_1)
+        for key, value in metrics.compute().items():
+            # To the bit but for the order of sums: training and test may run on other numbers of threads.
+            assert run.data.metrics[f"test/{setting}/{key}"] == pytest.approx(value, rel=1e-5)
+
+
+def test_a_failure_in_training_marks_the_run_failed(conflow: Command, workplace: Path) -> None:
+    folder = workplace / "runs" / "checkpoints"
+    if folder.exists():
+        folder.rename(workplace / "runs" / "kept")
+    folder.write_text("in the way of the checkpoints")
+    try:
+        result = conflow("train", "preset=smoke", "seed=4")
+    finally:
+        folder.unlink()
+        if (workplace / "runs" / "kept").exists():
+            (workplace / "runs" / "kept").rename(folder)
+    assert result.returncode != 0
+    assert (runs(workplace)[0].info.run_name, runs(workplace)[0].info.status) == ("cgp-s4", "FAILED")
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupted_run_is_killed_and_keeps_what_was_logged(
+    signum: signal.Signals, conflow: Command, workplace: Path
+) -> None:
+    name = f"cgp-s{50 + signum}"
+    arguments = ["train", "preset=smoke", f"seed={50 + signum}", "train.max_steps=1000000", "train.val_every=1000000"]
+    command = [sys.executable, "-m", "conflow", *arguments]
+    environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
+    process = subprocess.Popen(
+        command, cwd=workplace, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if (workplace / "runs" / "mlflow.db").exists():
+            named = [run for run in runs(workplace) if run.info.run_name == name]
+            if named and "train/loss" in named[0].data.metrics:
+                break
+        time.sleep(0.5)
+    process.send_signal(signum)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 128 + signum
+    assert stderr.decode().splitlines()[-1] == f"conflow: interrupted by {signum.name}"
+    (run,) = [run for run in runs(workplace) if run.info.run_name == name]
+    assert run.info.status == "KILLED"
+    assert run.data.metrics["train/loss"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("ablation=cpg",), "did you mean cgp?"),
+        (("train.max_stepz=3",), "did you mean train.max_steps?"),
+        (("train.lr=-1",), "train.lr=-1.0: expected a finite number above 0"),
+        (("preset=smoke", "data.path=missing.npz"), "data.path=missing.npz: no such file"),
+    ],
+)
+def test_a_bad_command_ends_in_one_line_before_anything_is_tracked(
+    arguments: tuple[str, ...], said: str, conflow: Command, workplace: Path, trained: tuple[Run, str]
+) -> None:
+    before = len(runs(workplace))
+    result = conflow("train", *arguments)
+    assert result.returncode == 2
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert len(runs(workplace)) == before
