@@ -158,7 +158,7 @@ def load(arguments: Sequence[str] = ()) -> Config:
     layers = [base]
     for axis, name in chosen.items():
         if name not in names(axis):
-            raise ConfigError(f"{axis}={name}: expected one of {', '.join(names(axis))}{_nearest(name, names(axis))}")
+            raise ConfigError(f"{axis}={name}: expected one of {', '.join(names(axis))}{nearest(name, names(axis))}")
         layers.append(_read(f"{axis}/{name}"))
     settings = _schema(Config)
     for key, value in [leaf for layer in layers for leaf in flatten(layer).items()] + pairs:
@@ -229,7 +229,8 @@ def _split(argument: str) -> tuple[str, str]:
     return key.strip(), value.strip()
 
 
-def _nearest(name: str, known: Sequence[str]) -> str:
+def nearest(name: str, known: Sequence[str]) -> str:
+    """An offer of the known name that is most like this one, where one is."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
@@ -238,7 +239,7 @@ def _set(settings: Any, key: str, value: Any) -> None:
     """Set one key to a value, or to the value that an argument's text means for a setting of its type."""
     types = {name: kind for name, kind, _ in _fields()}
     if key not in types:
-        raise ConfigError(f"{key}: no such setting{_nearest(key, list(types))}")
+        raise ConfigError(f"{key}: no such setting{nearest(key, list(types))}")
     try:
         parsed = _parse(value, types[key]) if isinstance(value, str) else value
         OmegaConf.update(settings, key, parsed, merge=False)

@@ -13,10 +13,11 @@ from typing import Any
 from filelock import FileLock
 from lightning.pytorch.loggers import MLFlowLogger
 from mlflow import MlflowClient
+from mlflow.artifacts import download_artifacts
 from mlflow.data.numpy_dataset import from_numpy
-from mlflow.entities import DatasetInput, InputTag, Metric, Param
+from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
 
-from conflow.experiment.config import Config, flatten
+from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.signals import Interrupted
 
@@ -59,6 +60,34 @@ def _relocate(old: str, new: str) -> None:
             "UPDATE runs SET artifact_uri = ? || substr(artifact_uri, ?) WHERE artifact_uri LIKE ? || '/%'",
             (new, len(old) + 1, old),
         )
+
+
+def find_run(wanted: str) -> Run:
+    """The run with this id, or the newest finished one of this name, or of any for "latest".
+
+    Raises:
+        ConfigError: there is none.
+    """
+    store = client()
+    experiment = store.get_experiment_by_name(EXPERIMENT)
+    assert experiment is not None
+    finished = store.search_runs(
+        [experiment.experiment_id], "attributes.status = 'FINISHED'", order_by=["attributes.start_time DESC"]
+    )
+    for run in finished:
+        if wanted in ("latest", run.info.run_id, run.info.run_name):
+            return run
+    known = sorted({str(run.info.run_name) for run in finished})
+    raise ConfigError(
+        f"run={wanted}: no such finished run, expected latest, an id or a name{nearest(wanted, known)}"
+        if known
+        else f"run={wanted}: no run has finished yet, expected one; try: make train"
+    )
+
+
+def artifact(run: Run, name: str) -> Path:
+    """The local path of a run's artifact, fetched where the store is remote."""
+    return Path(download_artifacts(run_id=run.info.run_id, artifact_path=name, tracking_uri=store_uri()))
 
 
 class RunLogger(MLFlowLogger):
