@@ -260,3 +260,58 @@ def test_a_trajectory_that_is_not_finite_is_not_called_feasible() -> None:
     x = apart(1.0, 1.0, 1.0)
     x[0, 1] = math.nan
     assert RobotAvoidance(TWO).violation(x).tolist() == [True]
+
+
+@constraints
+def test_the_swept_clearance_is_the_smallest_of_many_moments(
+    robots: PointRobots, build: Callable[[Barrier], Constraint]
+) -> None:
+    """All bodies go straight from waypoint to waypoint, seen at 2001 moments of each segment."""
+    constraint = build(Barrier())
+    x = trajectories(robots, batch=16)
+    tau = torch.linspace(0, 1, 2001, dtype=x.dtype)[:, None]
+    moments = torch.lerp(x[:, :-1, None], x[:, 1:, None], tau)
+    dense = constraint.clearance(moments.flatten(0, 1).flatten(0, 1)[:, None]).view(16, -1, len(tau)).amin(dim=2)
+    swept = constraint.swept_clearance(x)
+    assert bool((swept <= dense + 1e-12).all())
+    # Between two moments a separation changes by its length over 2000 at most: here less than 6 / 2000 / 2.
+    torch.testing.assert_close(swept, dense, rtol=0, atol=1.5e-3)
+
+
+@constraints
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_swept_clearance_is_never_above_that_of_the_waypoints(
+    robots: PointRobots, build: Callable[[Barrier], Constraint], dtype: torch.dtype
+) -> None:
+    """To the last bit, so what collides at a waypoint collides on the way too; often it is that of an end."""
+    constraint = build(Barrier())
+    x = trajectories(robots, batch=1000).to(dtype)
+    clearance = constraint.clearance(x)
+    ends = torch.minimum(clearance[:, :-1], clearance[:, 1:])
+    swept = constraint.swept_clearance(x)
+    assert swept.shape == (1000, x.shape[1] - 1)
+    assert bool((swept <= ends).all())
+    assert 0 < int((swept == ends).sum()) < swept.numel()
+
+
+def test_robots_that_pass_through_each_other_between_waypoints_are_found() -> None:
+    """They swap places in one step, and at a distance of 1/4 they pass; neither shows at the waypoints."""
+    through = torch.tensor([[[-1.0, 0, 1, 0], [1, 0, -1, 0]]])
+    past = torch.tensor([[[-1.0, 0, 1, 0.25], [1, 0, -1, 0.25]]])
+    x = torch.cat([through, past])
+    constraint = RobotAvoidance(TWO, 0.5)
+    assert constraint.violation(x).tolist() == [False, False]
+    assert constraint.swept_clearance(x).tolist() == [[-0.5], [-0.25]]
+
+
+def test_robots_that_only_part_or_stand_still_come_no_closer_on_the_way() -> None:
+    """Where there is no closer approach in between, the swept clearance is the smaller one of the ends."""
+    assert RobotAvoidance(TWO, 0.25).swept_clearance(apart(1, 2, 2, 0.5)).tolist() == [[0.75, 1.75, 0.25]]
+    standing = torch.zeros(1, 2, 4, dtype=torch.float64)
+    assert RobotAvoidance(TWO, 0.25).swept_clearance(standing).tolist() == [[-0.25]]
+
+
+def test_a_swept_clearance_that_is_not_a_number_stays_so() -> None:
+    x = apart(1.0, 1.0, 1.0)
+    x[0, 2] = math.nan
+    assert RobotAvoidance(TWO, 0.25).swept_clearance(x)[0].isnan().tolist() == [False, True]

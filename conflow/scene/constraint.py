@@ -59,6 +59,13 @@ class Constraint(nn.Module, ABC):
         """c = d - r at every waypoint, (batch, T): the gap between the nearest bodies, negative in collision."""
 
     @abstractmethod
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        """The smallest c while all bodies move straight from each waypoint to the next, (batch, T - 1).
+
+        Never above the clearance of the two waypoints, and below it where bodies pass each other in between.
+        """
+
+    @abstractmethod
     def barrier(self, x: Tensor) -> Tensor:
         """C(x), (batch,): about 0 where feasible, negative where not."""
 
@@ -83,6 +90,9 @@ class Sum(Constraint):
 
     def clearance(self, x: Tensor) -> Tensor:
         return torch.stack([term.clearance(x) for term in self.terms]).amin(dim=0)
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        return torch.stack([term.swept_clearance(x) for term in self.terms]).amin(dim=0)
 
     def barrier(self, x: Tensor) -> Tensor:
         return torch.stack([term.barrier(x) for term in self.terms]).sum(dim=0)
@@ -118,6 +128,17 @@ class Avoidance(Constraint):
 
     def clearance(self, x: Tensor) -> Tensor:
         return self._pairs(x)[1].amin(dim=2)
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        # The separation goes straight too, w(tau) = w + tau u, and is shortest at tau = -<w, u> / |u|^2.
+        w, c = self._pairs(x)
+        u = w.diff(dim=1)
+        w = w[:, :-1]
+        length = (u * u).sum(dim=3).clamp_min(torch.finfo(u.dtype).tiny)  # of bodies that keep their separation: 0
+        tau = (-(w * u).sum(dim=3) / length).clamp(0, 1)
+        nearest = torch.linalg.vector_norm(w + tau[..., None] * u, dim=3) - self.radius
+        # Rounding must not put the closest approach farther away than the ends.
+        return torch.minimum(nearest, torch.minimum(c[:, :-1], c[:, 1:])).amin(dim=2)
 
     def barrier(self, x: Tensor) -> Tensor:
         return self.shape.value(self._candidates(self._pairs(x)[1]).min(dim=2).values).sum(dim=1)
