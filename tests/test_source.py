@@ -194,6 +194,19 @@ def test_extreme_kernels_factor(named: Callable[[int, float], Source], length: i
     torch.testing.assert_close(L @ L.mT, built.covariance, rtol=0, atol=atol)
 
 
+@pytest.mark.parametrize("first", [(), ENDPOINTS, (2, 3)])
+def test_conditioning_again_starts_from_the_prior(first: Sequence[int]) -> None:
+    """Whatever a source is conditioned on, `condition` gives the dense posterior of K at the new waypoints alone."""
+    K, index, noise = rbf(T, 0.4, 1.3, 1e-3), (0, 4, -1), (0.0, 0.05, 0.0)
+    y = torch.randn(len(index), D, dtype=torch.float64, generator=seeded())
+    again = Source(K, first).condition(index, noise)
+    mean, covariance = posterior(K, index, noise, y)
+    # K's condition number is 1e4, so inverting it costs four of float64's sixteen digits.
+    torch.testing.assert_close(again.mean(y[None])[0], mean, rtol=0, atol=1e-10)
+    torch.testing.assert_close(again.covariance, covariance, rtol=0, atol=1e-10)
+    assert torch.equal(again.condition(first).covariance, Source(K, first).covariance)
+
+
 def test_a_stiff_process_between_two_points_is_a_straight_line() -> None:
     """For l = 10 the mean's weights are 1 - s and s."""
     length_scale = 10.0
@@ -248,6 +261,7 @@ def test_a_saved_source_draws_the_same_samples_when_reloaded() -> None:
     assert not torch.equal(loaded.sample(y, seeded(1)), saved.sample(y, seeded(1)))
     loaded.load_state_dict(saved.state_dict())
     assert torch.equal(loaded.sample(y, seeded(1)), saved.sample(y, seeded(1)))
+    assert torch.equal(loaded.condition((0, 3, -1)).covariance, saved.condition((0, 3, -1)).covariance)
     assert not torch.equal(loaded.sample(y, seeded(1)), saved.sample(y, seeded(2)))
 
 

@@ -31,6 +31,7 @@ class Source(nn.Module):
             variance is negative.
     """
 
+    prior: Tensor
     index: Tensor
     mean_map: Tensor
     covariance: Tensor
@@ -54,6 +55,7 @@ class Source(nn.Module):
         Sigma[:, exact] = 0
         Sigma = (Sigma + Sigma.mT) / 2
         L = _factor(Sigma, exact)
+        self.register_buffer("prior", K.clone())
         self.register_buffer("index", observed)
         self.register_buffer("mean_map", W)
         self.register_buffer("covariance", Sigma)
@@ -66,6 +68,14 @@ class Source(nn.Module):
     def mean(self, y: Tensor) -> Tensor:
         """W y: the mean trajectory given y (batch, O, D), in y's precision, (batch, T, D)."""
         return self.mean_map.to(y.dtype) @ y
+
+    def condition(self, index: Sequence[int], noise: Sequence[float] = ()) -> "Source":
+        """The same prior K conditioned on other waypoints, whatever this source is conditioned on.
+
+        Raises:
+            ValueError: as the class.
+        """
+        return Source(self.prior, index, noise)
 
     def sample(self, y: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """x_0 ~ p_0(. | y), one trajectory (T, D) for each row of y (batch, O, D): W y + L z, as one product."""
