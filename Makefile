@@ -3,6 +3,15 @@
 ABLATION ?= cgp
 SEED     ?= 0
 PRESET   ?= quick
+SEEDS    ?= 0 1 2
+ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
+JOBS     ?= 1
+RUN      ?= latest
+FORMAT   ?= table
+START    ?=
+GOAL     ?=
+OUT      ?= plans.npz
+NUM      ?= 64
 PORT     ?= 5000
 ARGS     ?=
 
@@ -10,7 +19,7 @@ PYTHON := .venv/bin/python
 CONFLOW = $(PYTHON) -m conflow
 
 .DEFAULT_GOAL := help
-.PHONY: help train ui test lint lock
+.PHONY: help train ablations evaluate compare sample figures ui test lint lock
 
 help:  ## List what can be made
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -20,6 +29,21 @@ help:  ## List what can be made
 
 train: .venv/installed  ## Train, sample, evaluate and track one experiment: ABLATION= SEED= PRESET= ARGS=
 	@$(CONFLOW) train ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) $(ARGS)
+
+ablations: .venv/installed  ## Train every ablation for every seed, and compare: SEEDS= ABLATIONS= PRESET= JOBS= ARGS=
+	@$(CONFLOW) ablations seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) $(ARGS)
+
+evaluate: .venv/installed  ## Sample a finished run again with other settings: RUN= ARGS="sample.steps=50 seed=1"
+	@$(CONFLOW) evaluate run=$(RUN) $(ARGS)
+
+compare: .venv/installed  ## Print the paper's tables and claims from finished runs: PRESET= FORMAT=table|markdown|csv|json
+	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(ARGS)
+
+sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= SEED= ARGS="obstacle=x,y,r"
+	@$(CONFLOW) sample run=$(RUN) start="$(START)" goal="$(GOAL)" out="$(OUT)" num=$(NUM) seed=$(SEED) $(ARGS)
+
+figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,...
+	@$(CONFLOW) figures run=$(RUN)
 
 ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
 	@$(CONFLOW) ui port=$(PORT)
@@ -43,6 +67,6 @@ lock:  ## Resolve pyproject.toml anew into requirements.lock
 	@echo "Installing the locked environment into .venv (a few minutes, once)"
 	@python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "conflow: python3 is $$(python3 --version), expected 3.11 or newer" >&2; exit 2; }
 	@test -x $(PYTHON) || python3 -m venv .venv
-	@$(PYTHON) -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	@$(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@$(PYTHON) -m pip install -qq --disable-pip-version-check -r requirements.lock
+	@$(PYTHON) -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@

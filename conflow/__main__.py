@@ -2,6 +2,10 @@
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def train(arguments: list[str]) -> None:
@@ -12,29 +16,106 @@ def train(arguments: list[str]) -> None:
     # First of all, and with little imported, so that a mistyped setting is answered at once.
     settings = config.load(arguments)
 
-    from rich.console import Console
-
     from conflow.experiment.train import train
 
-    console = Console()
+    console = _console()
     run_id = train(settings, console)
     console.print(f"Run {run_id} is finished. Look at it with: make ui", highlight=False)
 
 
+def ablations(arguments: list[str]) -> None:
+    """Train every ablation for every seed, what is not finished yet, and compare: seeds="0 1 2" ablations= jobs=1."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
+    options, settings = config.options(arguments, defaults)
+    jobs = config.whole(options, "jobs", 1, 1024)
+
+    from conflow.experiment import compare, grid
+
+    console = _console()
+    wanted = [f"preset={options['preset']}", *settings]
+    failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console)
+    compare.render(compare.collect(options["preset"], settings), "table", console)
+    if failed:
+        raise config.ConfigError(f"{failed} cells failed; the same command tries them again")
+
+
+def evaluate(arguments: list[str]) -> None:
+    """Sample a finished run again with other settings, and add the results to it: run=latest sample....= seed=."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    options, settings = config.options(arguments, {"run": "latest"})
+
+    from conflow.experiment.finished import evaluate_again
+
+    evaluate_again(options["run"], settings, _console())
+
+
+def compare(arguments: list[str]) -> None:
+    """Print the paper's tables and claims from all finished runs of a preset: preset=quick format=table."""
+    from conflow.experiment import compare, config
+
+    options, settings = config.options(arguments, {"preset": "quick", "format": "table"})
+
+    form = compare.checked_format(options["format"])
+    compare.render(compare.collect(options["preset"], settings), form, _console())
+
+
+def sample(arguments: list[str]) -> None:
+    """Plan from start= to goal= and write the plans and a picture: run=latest out=plans.npz num=64 obstacle=x,y,r."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    defaults = {"run": "latest", "out": "plans.npz", "num": "64", "guidance": "both", "seed": "0"}
+    options, _ = config.options(arguments, {"start": "", "goal": "", "obstacle": ""} | defaults, settings=False)
+    # The one option that may be given several times.
+    obstacles = [value for key, value in map(config.split, arguments) if key == "obstacle"]
+    for key in ("start", "goal"):
+        if not options[key]:
+            example = 'make sample START="-0.8,0,0.8,0" GOAL="0.8,0,-0.8,0"'
+            raise config.ConfigError(f"{key}: expected the robots' positions, found none; try: {example}")
+
+    from conflow import planner
+
+    print(planner.sample(options, obstacles))
+
+
+def figures(arguments: list[str]) -> None:
+    """Draw the pictures of finished runs into runs/figures/: run=latest, or run=NAME,NAME,... to compare them too."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    options, _ = config.options(arguments, {"run": "latest"}, settings=False)
+
+    from conflow.experiment.figures import gallery
+
+    gallery.draw(options["run"].split(","), _console())
+
+
 def ui(arguments: list[str]) -> None:
-    """Serve MLflow's pages of all runs on this machine, on port=5000 unless told otherwise."""
+    """Serve MLflow's pages of all runs on this machine: port=5000."""
+    from conflow.experiment import config
+
+    options, _ = config.options(arguments, {"port": "5000"}, settings=False)
+    port = config.whole(options, "port", 1, 65535)
+
     from conflow.experiment import ui
-    from conflow.experiment.config import ConfigError
 
-    port = "5000"
-    for argument in arguments:
-        key, _, port = argument.partition("=")
-        if key != "port" or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise ConfigError(f"{argument}: expected port=NUMBER with a number of at most 65535")
-    ui.serve(int(port))
+    ui.serve(port)
 
 
-COMMANDS = {"train": train, "ui": ui}
+COMMANDS = {
+    "train": train,
+    "ablations": ablations,
+    "evaluate": evaluate,
+    "compare": compare,
+    "sample": sample,
+    "figures": figures,
+    "ui": ui,
+}
 
 
 def main() -> None:
@@ -49,6 +130,14 @@ def main() -> None:
         COMMANDS[arguments.command](arguments.settings)
     except BaseException as error:
         sys.exit(_exit_code(error))
+
+
+def _console() -> "Console":
+    from rich.console import Console
+
+    # Without a terminal rich assumes 80 columns, in which the tables would be all line breaks.
+    console = Console()
+    return console if console.is_terminal else Console(width=140)
 
 
 def _exit_code(error: BaseException) -> int:

@@ -10,6 +10,7 @@ from conflow.experiment.metrics import (
     Diversity,
     EndpointError,
     Smoothness,
+    SweptCollisionRate,
     endpoint_error,
     quantile_interval,
     smoothness,
@@ -68,6 +69,17 @@ def test_the_object_collision_rate_counts_either_robot() -> None:
     second = first[:, :, [2, 3, 0, 1]]
     metric.update(torch.cat([clear, first, second]))
     assert metric.compute()["object_collision_count"] == 2
+
+
+def test_a_crossing_between_two_waypoints_is_a_swept_collision_alone() -> None:
+    x = torch.zeros(1, 3, 4)
+    x[0, :, 0] = torch.tensor([-0.9, -0.3, 0.3])
+    x[0, :, 2] = -x[0, :, 0]  # 0.6 apart at the second and the third waypoint, in one place half-way between them
+    at, swept = CollisionRate("at", ROBOTS), SweptCollisionRate("swept", ROBOTS)
+    for metric in (at, swept):
+        metric.update(x)
+    assert at.compute()["at_rate"] == 0
+    assert swept.compute()["swept_rate"] == 1
 
 
 def test_smoothness_of_constant_speed_is_zero_and_of_a_parabola_its_acceleration() -> None:

@@ -4,10 +4,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from conflow.experiment import config
-from conflow.experiment.build import random_stream
+from conflow.experiment.build import fitted, random_stream
+from conflow.experiment.config import Config
 from conflow.experiment.metrics import smoothness
 from conflow.experiment.module import SETTINGS, ConFlow
 from conflow.flow.sampler import integrate
+from conflow.flow.source import ENDPOINTS, fit_rbf
 from conflow.scene.trajectories import swap
 
 
@@ -101,11 +103,18 @@ def test_samples_start_as_smooth_as_the_source() -> None:
 def test_a_fitted_kernel_comes_from_the_demonstrations_and_survives_reloading() -> None:
     settings = config.load(["preset=smoke", "source.fit=true"])
     x = swap(200)
-    fitted, fresh = ConFlow(settings, 32, 4, x), ConFlow(settings, 32, 4)
-    y = fitted.source.observe(x)
-    assert not torch.equal(fitted.source.covariance, fresh.source.covariance)
-    fresh.load_state_dict(fitted.state_dict())
-    assert torch.equal(fitted.sample(y, "none", noise()), fresh.sample(y, "none", noise()))
+    fitting = fitted(settings, x)
+    length_scale, sigma_f = fit_rbf(x, ENDPOINTS, settings.source.epsilon)
+    assert (fitting.source.length_scale, fitting.source.sigma_f) == (length_scale, sigma_f)
+    assert fitting.source.length_scale != settings.source.length_scale
+    one, again = ConFlow(fitting, 32, 4), ConFlow(config.from_tree(fitting.tree()), 32, 4)
+    again.load_state_dict(one.state_dict())
+    y = one.source.observe(x)
+    assert torch.equal(one.sample(y, "none", noise()), again.sample(y, "none", noise()))
+
+
+def test_without_fit_the_kernel_stays_as_it_is_set(smoke: Config) -> None:
+    assert fitted(smoke, swap(200)) is smoke
 
 
 def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:

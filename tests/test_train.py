@@ -14,9 +14,10 @@ from mlflow.entities import Run
 from conflow.experiment import config
 from conflow.experiment.build import random_stream
 from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.finished import demonstrations, load_model
 from conflow.experiment.metrics import trajectory_metrics
 from conflow.experiment.module import SETTINGS
-from conflow.experiment.train import load_model
+from conflow.scene.trajectories import DemonstrationError
 from tests.conftest import Command
 
 SETTINGS_ARGUMENTS = ["preset=smoke", "seed=3"]
@@ -67,11 +68,12 @@ def test_a_run_holds_the_documented_metrics(trained: tuple[Run, str]) -> None:
     run, _ = trained
     expected = {"train/loss", "train/grad_norm", "train/steps_per_second", "val/loss"}
     for setting in SETTINGS:
-        for metric in ("robot_collision", "object_collision"):
+        for metric in ("robot_collision", "object_collision", "robot_collision_swept"):
             expected |= {f"test/{setting}/{metric}_{part}" for part in ("rate", "low", "high", "count")}
         for metric in ("smoothness_median", "smoothness_p95", "start_error", "end_error", "diversity"):
             expected |= {f"test/{setting}/{metric}{part}" for part in ("", "_low", "_high")}
-        expected |= {f"test/{setting}/latency_ms", f"test/{setting}/num"}
+        expected |= {f"test/{setting}/{name}" for name in ("latency_ms", "num", "start_drift", "end_drift")}
+    expected |= {f"baseline/{what}/robot_collision_count" for what in ("data", "source")}
     assert expected <= set(run.data.metrics)
 
 
@@ -105,7 +107,7 @@ def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Ru
     model = load_model(artifacts(run) / "model.ckpt")
     x_1 = DemonstrationData(model.config).test.x[torch.arange(64) % 50]
     for setting in SETTINGS:
-        x = model.sample(model.source.observe(x_1), setting, random_stream("test samples", 3, setting))
+        x = model.sample(model.source.observe(x_1), setting, random_stream("test samples", 3))
         metrics = trajectory_metrics(model.robots, model.obstacle)
         metrics.update(x=x, x_1=x_1)
         for key, value in metrics.compute().items():
@@ -130,7 +132,7 @@ def test_a_failure_in_training_marks_the_run_failed(conflow: Command, workplace:
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupted_run_is_killed_and_keeps_what_was_logged(
-    signum: signal.Signals, conflow: Command, workplace: Path
+    signum: signal.Signals, workplace: Path, trained: tuple[Run, str]
 ) -> None:
     name = f"cgp-s{50 + signum}"
     arguments = ["train", "preset=smoke", f"seed={50 + signum}", "train.max_steps=1000000", "train.val_every=1000000"]
@@ -173,3 +175,45 @@ def test_a_bad_command_ends_in_one_line_before_anything_is_tracked(
     assert said in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert len(runs(workplace)) == before
+
+
+def test_evaluating_again_adds_to_the_run_and_changes_nothing_that_it_had(
+    conflow: Command, workplace: Path, trained: tuple[Run, str]
+) -> None:
+    before, _ = trained
+    result = conflow("evaluate", f"run={before.info.run_id}", "sample.steps=3", "sample.solver=midpoint", "seed=8")
+    assert result.returncode == 0, result.stderr
+    after = store(workplace).get_run(before.info.run_id)
+    assert after.info.status == "FINISHED"
+    assert before.data.metrics.items() <= after.data.metrics.items()
+    prefix = "evaluate/sample.solver:midpoint sample.steps:3 seed:8"
+    model = load_model(artifacts(before) / "model.ckpt", ["sample.steps=3", "sample.solver=midpoint", "seed=8"])
+    x_1 = DemonstrationData(model.config).test.x[torch.arange(64) % 50]
+    x = model.sample(model.source.observe(x_1), "robot", random_stream("test samples", 8))
+    counted = after.data.metrics[f"{prefix}/robot/robot_collision_count"]
+    assert counted == model.robots.violation(x).sum()
+    assert (artifacts(before) / f"{prefix}.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("network.hidden=3",), "network.hidden=3: fixed by the run"),
+        (("run=cgp-s33",), "run=cgp-s33: no such finished run"),
+        (("sample.stepz=3",), "did you mean sample.steps?"),
+    ],
+)
+def test_what_a_finished_run_cannot_be_asked_is_refused(
+    arguments: tuple[str, ...], said: str, conflow: Command, trained: tuple[Run, str]
+) -> None:
+    result = conflow("evaluate", *arguments)
+    assert result.returncode == 2
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_run_is_not_judged_on_data_that_have_changed_since(trained: tuple[Run, str]) -> None:
+    run, _ = trained
+    assert demonstrations(run, config.load(SETTINGS_ARGUMENTS)).digest == run.data.tags["data_digest"]
+    with pytest.raises(DemonstrationError, match="on which cgp-s3 was trained"):
+        demonstrations(run, config.load([*SETTINGS_ARGUMENTS, "data.seed=1"]))

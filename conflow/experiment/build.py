@@ -1,6 +1,7 @@
 """From settings to the objects of `flow/` and `scene/`: the one place where a name becomes a class."""
 
 import hashlib
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,16 +14,25 @@ from conflow.flow.source import Source
 from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance
 from conflow.scene.robots import PointRobots
 
+CONDITIONED: dict[config.SourceKind, tuple[int, ...]] = {"gaussian": (), "gp": (), "cgp": source.ENDPOINTS}
+"""The waypoints at which each kind of source is conditioned."""
 
-def build_source(settings: config.Source, T: int, demonstrations: Tensor | None = None) -> Source:
-    """The source p_0 on T waypoints; with `fit`, its kernel fitted to the demonstrations (N, T, D) where given."""
+
+def build_source(settings: config.Source, T: int) -> Source:
+    """The source p_0 on T waypoints."""
     if settings.kind == "gaussian":
         return source.gaussian(T)
-    length_scale, sigma_f = settings.length_scale, settings.sigma_f
-    index = source.ENDPOINTS if settings.kind == "cgp" else ()
-    if settings.fit and demonstrations is not None:
-        length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.epsilon)
-    return Source(source.rbf(T, length_scale, sigma_f, settings.epsilon), index)
+    K = source.rbf(T, settings.length_scale, settings.sigma_f, settings.epsilon)
+    return Source(K, CONDITIONED[settings.kind])
+
+
+def fitted(settings: Config, demonstrations: Tensor) -> Config:
+    """The settings with the kernel most likely for demonstrations (N, T, D), where `source.fit` asks for it."""
+    if not settings.source.fit:
+        return settings
+    index = CONDITIONED[settings.source.kind]
+    length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.source.epsilon)
+    return replace(settings, source=replace(settings.source, length_scale=length_scale, sigma_f=sigma_f))
 
 
 def robot_avoidance(settings: Config, D: int) -> Constraint:

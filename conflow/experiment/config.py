@@ -7,7 +7,7 @@ import dataclasses
 import difflib
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
@@ -152,7 +152,7 @@ def load(arguments: Sequence[str] = ()) -> Config:
     Raises:
         ConfigError: an unknown name, a value of the wrong type or out of range.
     """
-    pairs = [_split(argument) for argument in arguments]
+    pairs = [split(argument) for argument in arguments]
     base = _read("base")
     chosen = {axis: str(dict(pairs).get(axis, base[axis])) for axis in ("preset", "ablation")}
     layers = [base]
@@ -182,6 +182,22 @@ def from_tree(tree: Any) -> Config:
     assert isinstance(config, Config)
     _check(config)
     return config
+
+
+def override(config: Config, arguments: Sequence[str], allowed: Sequence[str]) -> Config:
+    """The config with arguments `key=value` laid over it, of which only those that begin as allowed may come.
+
+    Raises:
+        ConfigError: as `load`; also for a key that is not allowed.
+    """
+    settings = _schema(Config)
+    for key, value in flatten(config.tree()).items():
+        _set(settings, key, value)
+    for key, value in map(split, arguments):
+        _set(settings, key, value)
+        if not key.startswith(tuple(allowed)):
+            raise ConfigError(f"{key}={value}: fixed by the run, expected settings of {' and '.join(allowed)} only")
+    return from_tree(OmegaConf.to_container(settings))
 
 
 def flatten(tree: Tree, prefix: str = "") -> Tree:
@@ -222,7 +238,37 @@ def _read(name: str) -> Tree:
     return tree
 
 
-def _split(argument: str) -> tuple[str, str]:
+def options(arguments: Sequence[str], defaults: Mapping[str, str], settings: bool = True) -> tuple[Tree, list[str]]:
+    """A command's own options out of its arguments `key=value`, and the other arguments, which are settings.
+
+    Raises:
+        ConfigError: an argument that is not of that form, or, where the command takes no settings, not an option.
+    """
+    chosen, rest = dict(defaults), []
+    for argument in arguments:
+        key, value = split(argument)
+        if key in chosen:
+            chosen[key] = value
+        elif settings:
+            rest.append(argument)
+        else:
+            raise ConfigError(f"{key}: no such option, expected {', '.join(chosen)}{nearest(key, list(chosen))}")
+    return chosen, rest
+
+
+def whole(options: Mapping[str, str], key: str, low: int, high: int) -> int:
+    """An option that is a whole number in [low, high].
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if not options[key].isdecimal() or not low <= int(options[key]) <= high:
+        raise ConfigError(f"{key}={options[key]}: expected a whole number of at least {low} and at most {high}")
+    return int(options[key])
+
+
+def split(argument: str) -> tuple[str, str]:
+    """Key and value of an argument `key=value`."""
     key, equals, value = argument.partition("=")
     if not equals:
         raise ConfigError(f"{argument}: expected key=value")

@@ -76,8 +76,12 @@ class CollisionRate(Metric):
         self.add_state("total", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
 
     def update(self, x: Tensor) -> None:
-        self.violations += self.constraint.violation(x).sum()
+        self.violations += self.violates(x).sum()
         self.total += len(x)
+
+    def violates(self, x: Tensor) -> Tensor:
+        """What counts, boolean (batch,)."""
+        return self.constraint.violation(x)
 
     def compute(self) -> dict[str, float]:
         count, total = int(self.violations), int(self.total)
@@ -88,6 +92,13 @@ class CollisionRate(Metric):
             f"{self.name}_high": high,
             f"{self.name}_count": count,
         }
+
+
+class SweptCollisionRate(CollisionRate):
+    """As `CollisionRate`, with the robots on straight lines between the waypoints, which see a crossing there too."""
+
+    def violates(self, x: Tensor) -> Tensor:
+        return ~(self.constraint.swept_clearance(x).amin(dim=1) >= 0)
 
 
 class _Values(Metric):
@@ -161,6 +172,7 @@ def trajectory_metrics(robots: Constraint, obstacle: Constraint) -> MetricCollec
         {
             "robot_collision": CollisionRate("robot_collision", robots),
             "object_collision": CollisionRate("object_collision", obstacle),
+            "robot_collision_swept": SweptCollisionRate("robot_collision_swept", robots),
             "smoothness": Smoothness(),
             "start_error": EndpointError("start_error", 0),
             "end_error": EndpointError("end_error", -1),

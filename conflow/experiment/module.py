@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
-from conflow.experiment import config
 from conflow.experiment.build import build_source, correction, obstacle_avoidance, random_stream, robot_avoidance
 from conflow.experiment.config import Config
 from conflow.flow.network import ResMLP
@@ -28,13 +27,12 @@ class ConFlow(LightningModule):
     Args:
         config: the experiment.
         T, D: waypoints and dimensions of a trajectory.
-        demonstrations: D+ (N, T, D), to which the source's kernel is fitted where `source.fit` asks for it.
     """
 
-    def __init__(self, config: Config, T: int, D: int, demonstrations: Tensor | None = None) -> None:
+    def __init__(self, config: Config, T: int, D: int) -> None:
         super().__init__()
         self.config, self.T, self.D = config, T, D
-        self.source = build_source(config.source, T, demonstrations)
+        self.source = build_source(config.source, T)
         self.v = ResMLP(T, D, config.network.hidden, config.network.blocks)
         self.robots, self.obstacle = robot_avoidance(config, D), obstacle_avoidance(config, D)
         self.u_c = correction(config.correction, self.robots, T)
@@ -59,9 +57,9 @@ class ConFlow(LightningModule):
         u_t = velocity(x_0, x_1) + lambda_c * M[:, None, None] * u_c
         return F.mse_loss(self.v(x_t, t), u_t)
 
-    def field(self, setting: Setting, sample: config.Sample | None = None) -> Field:
+    def field(self, setting: Setting) -> Field:
         """The velocity field that a setting samples from."""
-        sample = sample or self.config.sample
+        sample = self.config.sample
         if setting == "robot":
             return guided(self.v, self.u_c, sample.robot_weight)
         if setting == "obstacle":
@@ -70,7 +68,10 @@ class ConFlow(LightningModule):
 
     def sample(self, y: Tensor, setting: Setting = "none", noise: torch.Generator | None = None) -> Tensor:
         """Trajectories (batch, T, D), one for each observation y (batch, O, D) of the source (`source.observe`)."""
-        x_0 = self.source.sample(y, noise)
+        return self.flow(self.source.sample(y, noise), setting)
+
+    def flow(self, x_0: Tensor, setting: Setting = "none") -> Tensor:
+        """Where the ODE takes samples x_0 of the source, (batch, T, D)."""
         return integrate(self.field(setting), x_0, self.config.sample.steps, self.config.sample.solver)
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:

@@ -2,7 +2,8 @@
 
 from rich.table import Table
 
-from conflow.experiment.callbacks import Results
+from conflow.experiment.evaluation import Metrics
+from conflow.experiment.module import Setting
 
 ROWS = {
     "robot_collision_rate": "robot-collision rate",
@@ -15,7 +16,7 @@ ROWS = {
 }
 
 
-def results_table(results: Results, title: str) -> Table:
+def results_table(results: dict[Setting, Metrics], title: str) -> Table:
     """The test metrics of one run, a column for each setting, each with its 95 % interval."""
     num = int(next(iter(results.values()))["num"])
     table = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")

@@ -1,5 +1,6 @@
 """MLflow: the store, a run's life from start to end, and a Lightning logger that writes in batches."""
 
+import logging
 import os
 import platform
 import sqlite3
@@ -20,6 +21,11 @@ from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
 from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.signals import Interrupted
+
+# MLflow tells every user about every table of a new store,
+logging.getLogger("mlflow.store.db.utils").setLevel(logging.WARNING)
+# and shows a bar for every file that it copies.
+os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 EXPERIMENT = "conflow"
 RUNS = Path("runs")

@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from lightning import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from rich.console import Console
 
-from conflow.experiment import config as configuration
 from conflow.experiment import figures, report, tracking
-from conflow.experiment.callbacks import Evaluate, ProgressDisplay, TrainingLog, TrainingProgress
+from conflow.experiment.build import fitted
+from conflow.experiment.callbacks import Evaluate, TrainingLog, TrainingProgress
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.finished import MODEL_FILE
 from conflow.experiment.module import ConFlow
-
-MODEL_FILE = "model.ckpt"
+from conflow.experiment.progress import ProgressDisplay
 
 
 def train(config: Config, console: Console) -> str:
@@ -31,40 +30,33 @@ def train(config: Config, console: Console) -> str:
     _quiet()
     lightning.seed_everything(config.seed, verbose=False)
     data = DemonstrationData(config)
-    model = ConFlow(config, data.T, data.D, data.train.feasible().x)
+    model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
     with tracking.start(config, data) as logger:
         run_id = str(logger.run_id)
-        display = ProgressDisplay(console)
-        evaluate = Evaluate(data, display)
-        trainer = _trainer(config, logger, [evaluate, TrainingLog(config.train.log_every), TrainingProgress(display)])
-        trainer.fit(model, data)
-        title = f"{config.ablation}-s{config.seed}, preset {config.preset}"
+        kernel = model.config.source
+        logger.log_metrics({"source/length_scale": kernel.length_scale, "source/sigma_f": kernel.sigma_f}, 0)
+        with ProgressDisplay(console) as display:
+            evaluation = Evaluate(data, display)
+            callbacks = [evaluation, TrainingLog(config.train.log_every), TrainingProgress(display)]
+            trainer = _trainer(config, logger, callbacks)
+            trainer.fit(model, data)
         with tempfile.TemporaryDirectory() as folder:
             trainer.save_checkpoint(Path(folder, MODEL_FILE), weights_only=True)
             pictures = {
-                "page": figures.page(model, data, evaluate),
+                "page": figures.page(model, data, evaluation.done),
                 "demonstrations": figures.demonstrations(data),
-                "sources": figures.sources(model, evaluate),
+                "sources": figures.sources(model, evaluation.done),
             }
             figures.save(pictures, Path(folder, "figures"))
             logger.store.log_artifacts(run_id, folder)
-    console.print(report.results_table(evaluate.results, title))
+    title = f"{config.ablation}-s{config.seed}, preset {config.preset}"
+    console.print(report.results_table(evaluation.done.results, title))
     return run_id
-
-
-def load_model(path: Path) -> ConFlow:
-    """The model that a run left in `model.ckpt`, ready to sample. Reads weights and plain values, runs no code."""
-    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    described = checkpoint["conflow"]
-    model = ConFlow(configuration.from_tree(described["config"]), described["T"], described["D"])
-    model.load_state_dict(checkpoint["state_dict"])
-    return model.eval()
 
 
 def _quiet() -> None:
     """Silence what libraries say that no user of ours can act on."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    logging.getLogger("mlflow").setLevel(logging.ERROR)
     for message in (".*does not have many workers.*", ".*LeafSpec.*", ".*smaller than the logging interval.*"):
         warnings.filterwarnings("ignore", message)
 

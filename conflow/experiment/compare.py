@@ -1,0 +1,342 @@
+"""The paper's tables and claims, filled from finished runs in MLflow alone."""
+
+import csv
+import io
+import itertools
+import json
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal, cast, get_args
+
+from mlflow.entities import Run
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from conflow.experiment import config, tracking
+from conflow.experiment.config import Config, ConfigError
+from conflow.experiment.metrics import wilson
+
+Format = Literal["table", "markdown", "csv", "json"]
+Verdict = Literal["holds", "reversed", "not distinguishable", "no runs"]
+LEVEL = 0.05
+"""Claims are tested at this level, two-sided."""
+
+METHODS = {
+    "cgp": "ConFlow (D+ and D-)",
+    "no_negatives": "ConFlow (D+)",
+    "fm": "FM (D+)",
+    "fm_mixed": "FM (D+ and D-)",
+    "gaussian": "ConFlow, Gaussian source",
+    "gp": "ConFlow, GP source",
+}
+COLLISIONS = {
+    "test/none/robot_collision": "none: robot",
+    "test/robot/robot_collision": "robot: robot",
+    "test/obstacle/robot_collision": "obstacle: robot",
+    "test/obstacle/object_collision": "obstacle: object",
+    "test/none/object_collision": "none: object",
+}
+QUALITIES = {
+    "test/none/robot_collision": "collision rate",
+    "test/none/smoothness_median": "smoothness, median",
+    "test/none/smoothness_p95": "smoothness, 95th percentile",
+    "test/none/start_error": "start error per robot",
+    "test/none/end_error": "end error per robot",
+}
+# What the paper prints, Table 1 by row and Table 2 by column. Its FM (D+ and D-) cells for no and for robot guidance
+# look exchanged: a model of data of which 30 % collide cannot give 0.055 unguided.
+PAPER_1 = {
+    "cgp": (0.016, 0.004, 0.000, 0.035),
+    "no_negatives": (0.043, 0.004, 0.035, 0.074),
+    "fm": (0.031, 0.020, 0.039, 0.039),
+    "fm_mixed": (0.055, 0.270, 0.281, 0.059),
+}
+PAPER_2 = {
+    "gaussian": (0.0288, 0.0678, 0.2218, 0.0267, 0.0276),
+    "cgp": (0.0156, 0.0174, 0.0309, 0.0006, 0.0006),
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of a table.
+
+    Attributes:
+        value, low, high: of a rate the pooled one with Wilson's interval; else the mean over seeds, without one.
+        seed_low, seed_high: the smallest and the largest of the seeds.
+        count: trajectories in collision over all seeds, of a rate.
+        trajectories: over all seeds.
+    """
+
+    table: str
+    row: str
+    column: str
+    paper: float | None
+    value: float
+    low: float | None
+    high: float | None
+    seed_low: float
+    seed_high: float
+    seeds: int
+    count: int | None
+    trajectories: int
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence of the paper, and what the runs say to it."""
+
+    text: str
+    verdict: Verdict
+    p: float | None
+    detail: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Both tables, the claims, and which runs they come from."""
+
+    preset: str
+    cells: list[Cell]
+    claims: list[Claim]
+    runs: dict[str, list[str]]
+
+
+def finished_runs(settings: Config, data_digest: str | None = None) -> list[Run]:
+    """FINISHED runs of exactly this config (and on exactly this data), the newest first."""
+    store = tracking.client()
+    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    assert experiment is not None
+    conditions = ["attributes.status = 'FINISHED'", f"tags.config_sha = '{settings.sha()}'"]
+    if data_digest is not None:
+        conditions.append(f"tags.data_digest = '{data_digest}'")
+    return list(
+        store.search_runs([experiment.experiment_id], " AND ".join(conditions), order_by=["attributes.start_time DESC"])
+    )
+
+
+def checked_format(name: str) -> Format:
+    """The format of this name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for known in get_args(Format):
+        if name == known:
+            return cast(Format, known)
+    raise ConfigError(f"format={name}: expected one of {', '.join(get_args(Format))}")
+
+
+def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
+    """Compare the newest finished run of every ablation and seed at a preset, with arguments as they were trained.
+
+    Raises:
+        ConfigError: there is no such run.
+    """
+    runs = {ablation: _by_seed(ablation, preset, arguments) for ablation in _ablations()}
+    runs = {ablation: by_seed for ablation, by_seed in runs.items() if by_seed}
+    if not runs:
+        raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
+    cells = [*_table_1(runs), *_table_2(runs)]
+    return Comparison(
+        preset, cells, _claims(runs), {name: [_id(run) for run in by_seed] for name, by_seed in runs.items()}
+    )
+
+
+def render(comparison: Comparison, form: Format, console: Console) -> None:
+    """Print a comparison as a table, Markdown, CSV (the cells) or JSON (everything)."""
+    if form == "json":
+        console.out(json.dumps(asdict(comparison), indent=1), highlight=False)
+    elif form == "csv":
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(asdict(comparison.cells[0])), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(cell) for cell in comparison.cells)
+        console.out(text.getvalue(), end="", highlight=False)
+    else:
+        for title, header, rows in _sheets(comparison):
+            if form == "markdown":
+                console.out(_markdown(title, header, rows), highlight=False)
+            else:
+                console.print(_table(title, header, rows))
+
+
+def _ablations() -> list[str]:
+    """Those of the paper in its order, then the others by name."""
+    return [*METHODS, *(name for name in config.names("ablation") if name not in METHODS)]
+
+
+def _by_seed(ablation: str, preset: str, arguments: Sequence[str]) -> list[Run]:
+    """The newest run of each seed, by seed."""
+    store = tracking.client()
+    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    assert experiment is not None
+    condition = f"attributes.status = 'FINISHED' AND tags.ablation = '{ablation}' AND tags.preset = '{preset}'"
+    newest: dict[int, Run] = {}
+    for run in store.search_runs([experiment.experiment_id], condition, order_by=["attributes.start_time DESC"]):
+        seed = int(run.data.tags["seed"])
+        asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
+        if run.data.tags["config_sha"] == asked.sha():
+            newest.setdefault(seed, run)
+    return [newest[seed] for seed in sorted(newest)]
+
+
+def _id(run: Run) -> str:
+    return str(run.info.run_id)
+
+
+def _table_1(runs: Mapping[str, list[Run]]) -> list[Cell]:
+    cells = []
+    for ablation, by_seed in runs.items():
+        papers = itertools.chain(PAPER_1.get(ablation, ()), itertools.repeat(None))
+        for (metric, column), paper in zip(COLLISIONS.items(), papers, strict=False):
+            cells.append(_cell("1", METHODS.get(ablation, ablation), column, paper, metric, by_seed))
+    for ablation in ("cgp", "gaussian", "gp"):
+        if ablation in runs:
+            row = f"no model: source {ablation}"
+            cells += [_cell("1", row, name, None, _baseline(key, "source"), runs[ablation]) for key, name in _UNGUIDED]
+    # The same test demonstrations for every seed, so they are counted once.
+    one = next(iter(runs.values()))[:1]
+    cells += [_cell("1", "no model: test data", name, None, _baseline(key, "data"), one) for key, name in _UNGUIDED]
+    return cells
+
+
+_UNGUIDED = [(key, column) for key, column in COLLISIONS.items() if key.startswith("test/none/")]
+
+
+def _baseline(key: str, of: str) -> str:
+    return key.replace("test/none/", f"baseline/{of}/")
+
+
+def _table_2(runs: Mapping[str, list[Run]]) -> list[Cell]:
+    return [
+        _cell("2", row, METHODS[ablation], paper, metric, runs[ablation])
+        for ablation, papers in PAPER_2.items()
+        if ablation in runs
+        for (metric, row), paper in zip(QUALITIES.items(), papers, strict=True)
+    ]
+
+
+def _cell(table: str, row: str, column: str, paper: float | None, metric: str, runs: Sequence[Run]) -> Cell:
+    trajectories = [int(run.data.metrics[metric.rsplit("/", 1)[0] + "/num"]) for run in runs]
+    count, low, high = None, None, None
+    if f"{metric}_count" in runs[0].data.metrics:
+        counts = [int(run.data.metrics[f"{metric}_count"]) for run in runs]
+        values = [of_seed / total for of_seed, total in zip(counts, trajectories, strict=True)]
+        count = sum(counts)
+        value = count / sum(trajectories)
+        low, high = wilson(count, sum(trajectories))
+    else:
+        values = [run.data.metrics[metric] for run in runs]
+        value = statistics.mean(values)
+    return Cell(
+        table, row, column, paper, value, low, high, min(values), max(values), len(runs), count, sum(trajectories)
+    )
+
+
+def _claims(runs: Mapping[str, list[Run]]) -> list[Claim]:
+    """The paper's claims in words, each as "a is lower than b"."""
+    none, *_ = COLLISIONS
+    rates = [
+        ("ConFlow collides less than FM, without guidance", "cgp", "fm", none),
+        *(
+            (f"negatives help ConFlow ({column})", "cgp", "no_negatives", metric)
+            for metric, column in list(COLLISIONS.items())[:4]
+        ),
+        ("naive negatives hurt FM, without guidance", "fm", "fm_mixed", none),
+        ("CGP beats Gaussian: collision rate", "cgp", "gaussian", none),
+    ]
+    claims = [_compare(runs, text, lower, higher, metric, _fisher) for text, lower, higher, metric in rates]
+    others = [(metric, row) for metric, row in QUALITIES.items() if metric != none]
+    return claims + [
+        _compare(runs, f"CGP beats Gaussian: {row}", "cgp", "gaussian", metric, _permutation) for metric, row in others
+    ]
+
+
+Test = Callable[[str, Sequence[Run], Sequence[Run]], tuple[float, float, float]]
+
+
+def _compare(runs: Mapping[str, list[Run]], text: str, lower: str, higher: str, metric: str, test: Test) -> Claim:
+    if lower not in runs or higher not in runs:
+        missing = " and ".join(name for name in (lower, higher) if name not in runs)
+        return Claim(text, "no runs", None, f"no finished run of {missing}")
+    a, b, p = test(metric, runs[lower], runs[higher])
+    verdict: Verdict = "not distinguishable" if p >= LEVEL or a == b else "holds" if a < b else "reversed"
+    return Claim(text, verdict, p, f"{a:.4f} against {b:.4f}, {len(runs[lower])} and {len(runs[higher])} seeds")
+
+
+def _fisher(metric: str, lower: Sequence[Run], higher: Sequence[Run]) -> tuple[float, float, float]:
+    """Both pooled rates, and the p of Fisher's exact test on the counts."""
+    a, b = (_cell("", "", "", None, metric, runs) for runs in (lower, higher))
+    assert a.count is not None
+    assert b.count is not None
+    table = [[a.count, a.trajectories - a.count], [b.count, b.trajectories - b.count]]
+    return a.value, b.value, float(stats.fisher_exact(table).pvalue)
+
+
+def _permutation(metric: str, lower: Sequence[Run], higher: Sequence[Run]) -> tuple[float, float, float]:
+    """Both means over seeds, and the p of the exact test that permutes the seeds between the two."""
+    values = [[run.data.metrics[metric] for run in runs] for runs in (lower, higher)]
+    a, b = map(statistics.mean, values)
+    pooled = values[0] + values[1]
+    observed = abs(a - b)
+    differences = []
+    for chosen in itertools.combinations(range(len(pooled)), len(values[0])):
+        first = sum(pooled[i] for i in chosen)
+        differences.append(abs(first / len(values[0]) - (sum(pooled) - first) / len(values[1])))
+    # Relative slack: the observed split must count as itself, whatever the order of summation.
+    return a, b, sum(d >= observed * (1 - 1e-9) for d in differences) / len(differences)
+
+
+def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, header and rows of both tables and of the claims, as text."""
+    titles = {
+        "1": f"Table 1: collision rates, preset {comparison.preset} (setting: what is hit)",
+        "2": f"Table 2: sources, without guidance, preset {comparison.preset}",
+    }
+    sheets = []
+    for table, title in titles.items():
+        cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == table}
+        columns = list(dict.fromkeys(column for _, column in cells))
+        rows = []
+        for row in dict.fromkeys(row for row, _ in cells):
+            of_row = [cells.get((row, column)) for column in columns]
+            known = next(cell for cell in of_row if cell is not None)
+            size = f"{known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
+            rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row)])
+        if cells:
+            sheets.append((title, ["", *columns], rows))
+    claims = [
+        [claim.text, claim.verdict, "" if claim.p is None else f"p = {claim.p:.2g}", claim.detail]
+        for claim in comparison.claims
+    ]
+    sheets.append(("The paper's claims", ["claim", "verdict", "exact test", "values"], claims))
+    return sheets
+
+
+def _text(cell: Cell) -> str:
+    parts = [f"{cell.value:.4f}"]
+    if cell.low is not None:
+        parts[0] += f" [{cell.low:.4f}, {cell.high:.4f}]"
+    if cell.seeds > 1:
+        parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
+    if cell.paper is not None:
+        parts.append(f"paper {cell.paper:.4g}")
+    return "\n".join(parts)
+
+
+def _table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(title=title, show_lines=True)
+    for name in header:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*(text.replace("[", "\\[") for text in row))
+    return table
+
+
+def _markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"**{title}**", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(text.replace("\n", "<br>") for text in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"

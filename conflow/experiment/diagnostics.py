@@ -1,0 +1,102 @@
+"""What guidance does along the sampling ODE, and how results depend on its weight and on the solver."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from conflow.experiment.metrics import endpoint_error, smoothness
+from conflow.experiment.module import ConFlow, Setting
+from conflow.flow.sampler import Solver, guided, integrate, states
+from conflow.scene.constraint import Constraint
+
+EVALUATIONS: dict[Solver, int] = {"euler": 1, "midpoint": 2, "rk4": 4}
+"""Network evaluations of one step."""
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """One setting along the sampling ODE, at t = 0, 1/steps, ..., 1: tensors (steps + 1,).
+
+    Attributes:
+        t: flow time.
+        ratio: |lambda u^c(x_t)| / |v(x_t, t)|, both the norm over the whole batch, i.e. the ratio of root mean squares.
+        robot_barrier: mean over the batch of the robots' barrier C(x_t), in workspace units.
+        obstacle_barrier: that of the obstacle's barrier.
+        start_drift: distance between the guided and the unguided x_1 of the same x_0 at the start, mean over robots and
+            batch, in workspace units.
+        end_drift: the same at the goal.
+    """
+
+    t: Tensor
+    ratio: Tensor
+    robot_barrier: Tensor
+    obstacle_barrier: Tensor
+    start_drift: float
+    end_drift: float
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Trajectories without guidance from one solver at one number of steps.
+
+    Attributes:
+        evaluations: network evaluations for one trajectory.
+        collisions: how many trajectories violate the robots' constraint.
+        smoothness: of each trajectory, (batch,).
+    """
+
+    evaluations: int
+    collisions: int
+    smoothness: Tensor
+
+
+@torch.no_grad()
+def guidance(model: ConFlow, setting: Setting, x_0: Tensor) -> Guidance:
+    """Follow a setting's ODE from samples x_0 (batch, T, D) of the source."""
+    steps, solver = model.config.sample.steps, model.config.sample.solver
+    field, v = model.field(setting), model.field("none")
+    t = torch.arange(steps + 1) / steps
+    ratio, robot_barrier, obstacle_barrier = [], [], []
+    x = x_0
+    for time, x in zip(t, states(field, x_0, steps, solver), strict=True):
+        at = time.expand(len(x))
+        flow = v(x, at)
+        ratio.append((field(x, at) - flow).norm() / flow.norm())
+        robot_barrier.append(model.robots.barrier(x).mean())
+        obstacle_barrier.append(model.obstacle.barrier(x).mean())
+    plain = integrate(v, x_0, steps, solver)
+    start_drift, end_drift = (float(endpoint_error(x, plain, waypoint).mean()) for waypoint in (0, -1))
+    return Guidance(
+        t, torch.stack(ratio), torch.stack(robot_barrier), torch.stack(obstacle_barrier), start_drift, end_drift
+    )
+
+
+def avoided(model: ConFlow, setting: Setting) -> Constraint:
+    """What a setting is about: the obstacle, or else the robots."""
+    return model.obstacle if setting == "obstacle" else model.robots
+
+
+def collisions_by_weight(model: ConFlow, setting: Setting, x_0: Tensor, weights: Sequence[float]) -> list[int]:
+    """How many of the trajectories from x_0 (batch, T, D) hit what the setting avoids, at each guidance weight."""
+    sample = model.config.sample
+    u_c = model.u_c_obstacle if setting == "obstacle" else model.u_c
+    fields = [guided(model.v, u_c, weight) for weight in weights]
+    return [
+        int(avoided(model, setting).violation(integrate(field, x_0, sample.steps, sample.solver)).sum())
+        for field in fields
+    ]
+
+
+def by_evaluations(model: ConFlow, solver: Solver, x_0: Tensor, evaluations: Sequence[int]) -> list[Solved]:
+    """Trajectories from x_0 (batch, T, D) without guidance, for each number of network evaluations.
+
+    Numbers that are no multiple of what one step of the solver takes are rounded down to one.
+    """
+    solved = []
+    for number in evaluations:
+        steps = max(1, number // EVALUATIONS[solver])
+        x = integrate(model.field("none"), x_0, steps, solver)
+        solved.append(Solved(steps * EVALUATIONS[solver], int(model.robots.violation(x).sum()), smoothness(x)))
+    return solved

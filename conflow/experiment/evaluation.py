@@ -1,0 +1,91 @@
+"""Sampling a model under the three inference settings, and measuring what it made."""
+
+import time
+from dataclasses import dataclass, field
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from conflow.experiment.build import random_stream
+from conflow.experiment.metrics import endpoint_error, trajectory_metrics
+from conflow.experiment.module import SETTINGS, ConFlow, Setting
+from conflow.experiment.progress import ProgressDisplay
+
+LATENCY_BATCH = 256
+
+Metrics = dict[str, float]
+
+
+@dataclass
+class Evaluation:
+    """What a model makes of its source for given starts and goals.
+
+    Attributes:
+        source_samples: x_0 of the source, (num, T, D), the same for every setting.
+        samples: the trajectories of each setting, (num, T, D).
+        results: the metrics of each setting.
+        baseline: the same metrics of what no model touched: "data", the demonstrations themselves, and "source".
+    """
+
+    source_samples: Tensor
+    samples: dict[Setting, Tensor] = field(default_factory=dict)
+    results: dict[Setting, Metrics] = field(default_factory=dict)
+    baseline: dict[str, Metrics] = field(default_factory=dict)
+
+    def keyed(self, prefix: str = "test/", baseline: bool = True) -> Metrics:
+        """The metrics under their names in MLflow."""
+        groups = {f"{prefix}{setting}": metrics for setting, metrics in self.results.items()}
+        if baseline:
+            groups |= {f"baseline/{name}": metrics for name, metrics in self.baseline.items()}
+        return {f"{group}/{name}": value for group, metrics in groups.items() for name, value in metrics.items()}
+
+
+@torch.inference_mode()
+def evaluate(model: ConFlow, demonstrations: Tensor, display: ProgressDisplay) -> Evaluation:
+    """Sample `sample.num` trajectories under every setting and measure them.
+
+    Each gets the start and goal of a demonstration (N, T, D), the first again after the last. All settings start
+    from the same x_0, which depends on the seed alone, so they differ by their guidance only.
+    """
+    task = display.add("sampling", len(SETTINGS))
+    x_1 = cycle(demonstrations, model.config.sample.num).to(model.device)
+    y = model.source.observe(x_1)
+    x_0 = model.source.sample(y, random_stream("test samples", model.config.seed, device=model.device))
+    evaluation = Evaluation(x_0.cpu())
+    evaluation.baseline["data"] = measure(model, demonstrations.to(model.device), demonstrations.to(model.device))
+    evaluation.baseline["source"] = measure(model, x_0, x_1)
+    for done, setting in enumerate(SETTINGS, start=1):
+        x = model.flow(x_0, setting)
+        evaluation.samples[setting] = x.cpu()
+        drift = {
+            f"{name}_drift": float(endpoint_error(x.cpu(), evaluation.samples["none"], waypoint).mean())
+            for name, waypoint in {"start": 0, "end": -1}.items()
+        }
+        latency = {"latency_ms": _latency_ms(model, y, setting)}
+        evaluation.results[setting] = measure(model, x, x_1) | drift | latency
+        display.update(task, done, f"setting {setting}")
+    return evaluation
+
+
+def measure(model: ConFlow, x: Tensor, x_1: Tensor) -> Metrics:
+    """The metrics of trajectories x whose starts and goals were those of x_1, both (num, T, D)."""
+    metrics = trajectory_metrics(model.robots, model.obstacle).to(model.device)
+    metrics.update(x=x, x_1=x_1)
+    return metrics.compute() | {"num": len(x)}
+
+
+def cycle(x: Tensor, num: int) -> Tensor:
+    """The first `num` rows of x, beginning again where there are fewer."""
+    return x[torch.arange(num) % len(x)]
+
+
+def _latency_ms(model: ConFlow, y: Tensor, setting: Setting, repetitions: int = 3) -> float:
+    """Median time of sampling one batch of 256, in milliseconds."""
+    y = cycle(y, LATENCY_BATCH)
+    times = []
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        model.sample(y, setting).cpu()  # to the host, so that an accelerator has finished
+        times.append(1000 * (time.perf_counter() - start))
+    return median(times)

@@ -1,0 +1,82 @@
+"""All pictures of finished runs, written under runs/figures/ and logged to the runs."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from mlflow.entities import Run
+from rich.console import Console
+
+from conflow.experiment import diagnostics, tracking
+from conflow.experiment.build import random_stream
+from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.evaluation import Evaluation, cycle
+from conflow.experiment.figures import curves, workspace
+from conflow.experiment.figures.animation import animation
+from conflow.experiment.finished import MODEL_FILE, demonstrations, load_model
+from conflow.experiment.module import SETTINGS, ConFlow
+
+NUM = 512
+
+
+def draw(wanted: Sequence[str], console: Console) -> None:
+    """Draw the pictures of each run; of several runs also a comparison of what they generate.
+
+    Raises:
+        ConfigError: there is no such run.
+    """
+    runs = [tracking.find_run(name) for name in wanted]
+    made = [(str(run.info.run_name), *_draw_run(run, console)) for run in runs]
+    if len(runs) > 1:
+        console.print("all runs: methods.png", highlight=False)
+        workspace.save({"methods": workspace.methods(made)}, _folder())
+
+
+def _folder() -> Path:
+    return tracking.RUNS / "figures"
+
+
+def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation]:
+    """Write and log a run's pictures; its model and the samples that they show."""
+    model = load_model(tracking.artifact(run, MODEL_FILE))
+    data = demonstrations(run, model.config)
+    name = str(run.info.run_name)
+    # A name given in MLflow's pages may hold anything, also a way out of the folder.
+    folder = _folder() / re.sub(r"[^\w-]+", "_", name)
+    console.print(f"{name}: {NUM} trajectories under each setting", highlight=False)
+    evaluation = sample(model, data)
+    x_0 = evaluation.source_samples
+    pictures: dict[str, Callable[[], Figure]] = {
+        "demonstrations": lambda: workspace.demonstrations(data),
+        "sources": lambda: workspace.sources(model, evaluation),
+        "page": lambda: workspace.page(model, data, evaluation),
+        "flow": lambda: workspace.flow(model, x_0),
+        "distances": lambda: workspace.distances(model, evaluation),
+        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0) for s in SETTINGS}),
+        "solver_steps": lambda: curves.solver_steps(model, x_0),
+        "guidance_weight": lambda: curves.guidance_weight(model, x_0),
+    }
+    for title, picture in pictures.items():
+        console.print(f"{name}: {title}.png", highlight=False)
+        workspace.save({title: picture()}, folder)
+    console.print(f"{name}: animation.html", highlight=False)
+    page = folder / "animation.html"
+    page.write_text(animation(model, evaluation, f"ConFlow, run {name}"), encoding="utf-8")
+    # Training logged its own of these, of all its samples.
+    _log(run, [page, *(folder / f"{title}.png" for title in pictures if title not in workspace.OF_TRAINING)])
+    console.print(f"{name}: pictures are in {folder}", highlight=False)
+    return model, evaluation
+
+
+def sample(model: ConFlow, data: DemonstrationData) -> Evaluation:
+    """Trajectories under every setting from the same x_0, with starts and goals of test demonstrations."""
+    y = model.source.observe(cycle(data.test.x, NUM))
+    x_0 = model.source.sample(y, random_stream("figures", model.config.seed))
+    return Evaluation(x_0, {setting: model.flow(x_0, setting) for setting in SETTINGS})
+
+
+def _log(run: Run, files: Sequence[Path]) -> None:
+    store = tracking.client()
+    for file in files:
+        store.log_artifact(run.info.run_id, str(file), "figures")

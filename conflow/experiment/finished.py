@@ -1,0 +1,74 @@
+"""What a finished run left, and sampling from it again."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from mlflow.entities import Run
+from rich.console import Console
+
+from conflow.experiment import config as configuration
+from conflow.experiment import report, tracking
+from conflow.experiment.config import Config
+from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.evaluation import evaluate
+from conflow.experiment.module import ConFlow
+from conflow.experiment.progress import ProgressDisplay
+from conflow.scene.trajectories import DemonstrationError
+
+MODEL_FILE = "model.ckpt"
+SAMPLING = ("sample.", "seed")
+
+
+def load_model(path: Path, arguments: Sequence[str] = ()) -> ConFlow:
+    """The model that a run left in `model.ckpt`, ready to sample. Reads weights and plain values, runs no code.
+
+    Args:
+        path: the file.
+        arguments: settings `sample....=value` and `seed=value` to sample with in place of the run's own.
+
+    Raises:
+        ConfigError: an argument that is none of these.
+    """
+    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    described = checkpoint["conflow"]
+    config = configuration.override(configuration.from_tree(described["config"]), arguments, SAMPLING)
+    model = ConFlow(config, described["T"], described["D"])
+    model.load_state_dict(checkpoint["state_dict"])
+    return model.eval()
+
+
+def demonstrations(run: Run, config: Config) -> DemonstrationData:
+    """The demonstrations that a run was trained on, generated or read again.
+
+    Raises:
+        DemonstrationError: they are others by now.
+    """
+    data = DemonstrationData(config)
+    trained_on = run.data.tags.get("data_digest")
+    if data.digest != trained_on:
+        raise DemonstrationError(
+            f"data.path={config.data.path}: found data {data.digest}, expected {trained_on}, on which "
+            f"{run.info.run_name} was trained"
+        )
+    return data
+
+
+def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> None:
+    """Sample a finished run anew with other settings, and add the results to it.
+
+    Metrics go under `evaluate/<settings>/SETTING/...`, where no metric of training stands, and the settings beside
+    them into the artifact `evaluate/<settings>.yaml`.
+    """
+    run = tracking.find_run(wanted)
+    model = load_model(tracking.artifact(run, MODEL_FILE), arguments)
+    # MLflow allows no = in a metric's name.
+    label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or "same settings"
+    data = demonstrations(run, model.config)
+    with ProgressDisplay(console) as display:
+        evaluation = evaluate(model, data.test.x, display)
+    logger = tracking.RunLogger(tracking.client(), run.info.run_id)
+    logger.log_metrics(evaluation.keyed(f"evaluate/{label}/", baseline=False), 0)
+    logger.save()
+    logger.store.log_dict(run.info.run_id, model.config.tree(), f"evaluate/{label}.yaml")
+    console.print(report.results_table(evaluation.results, f"{run.info.run_name}, {label}"))

@@ -1,0 +1,132 @@
+"""Every ablation for every seed: which cells are finished, which are to do, and a process for each that is."""
+
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from rich.console import Console
+
+from conflow.experiment import compare, config
+from conflow.experiment.config import Config
+from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.progress import ProgressDisplay
+from conflow.scene.trajectories import DemonstrationError
+
+STEPS = re.compile(r"^(training|sampling) (\d+)/(\d+)")
+
+
+@dataclass
+class Cell:
+    """One experiment of the grid: the arguments that ask for it, and how far it is."""
+
+    arguments: list[str]
+    config: Config
+    share: float = 0.0
+    note: str = ""
+    failed: bool = False
+    output: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        return f"{self.config.ablation}-s{self.config.seed}"
+
+
+def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str], jobs: int, console: Console) -> int:
+    """Train the cells that are not finished yet, `jobs` at a time; the number of cells that failed.
+
+    A cell is finished when MLflow has a FINISHED run of the same config on the same data, so a grid that was stopped
+    goes on where it stopped. Each cell is a process of its own: one that fails leaves the others alone.
+
+    Raises:
+        ConfigError: any of the cells cannot be asked for; then none is started.
+    """
+    cells = [
+        Cell(chosen, config.load(chosen))
+        for seed in seeds
+        for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
+    ]
+    todo = [cell for cell in cells if not _finished(cell.config)]
+    console.print(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before", highlight=False)
+    if todo:
+        _train_all(todo, jobs, console)
+    for cell in todo:
+        if cell.failed:
+            console.print(
+                f"{cell.name} failed: {cell.output[-1] if cell.output else 'no output'}",
+                highlight=False,
+                soft_wrap=True,
+            )
+    return sum(cell.failed for cell in todo)
+
+
+def _finished(settings: Config) -> bool:
+    try:
+        return bool(compare.finished_runs(settings, DemonstrationData(settings).digest))
+    except DemonstrationError:
+        return False  # the cell itself will say so, and the others go on
+
+
+def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
+    waiting: queue.SimpleQueue[Cell] = queue.SimpleQueue()
+    for cell in cells:
+        waiting.put(cell)
+    processes: set[subprocess.Popen[str]] = set()
+    threads = [threading.Thread(target=_work, args=(waiting, processes, jobs), daemon=True) for _ in range(jobs)]
+    with ProgressDisplay(console) as display:
+        task = display.add("cells", len(cells))
+        for thread in threads:
+            thread.start()
+        try:
+            while any(thread.is_alive() for thread in threads):
+                time.sleep(0.5)
+                busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
+                display.update(task, round(sum(cell.share for cell in cells), 1), busy)
+        except BaseException:
+            while not waiting.empty():
+                waiting.get()
+            for process in list(processes):
+                process.terminate()  # each marks its own run KILLED
+            for thread in threads:
+                thread.join()
+            raise
+
+
+def _work(waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], jobs: int) -> None:
+    """Train one waiting cell after the other."""
+    while True:
+        try:
+            cell = waiting.get_nowait()
+        except queue.Empty:
+            return
+        process = subprocess.Popen(
+            [sys.executable, "-m", "conflow", "train", *cell.arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            # Processes that share the cores would otherwise each start a thread for every core and crawl.
+            env={"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // jobs)), **os.environ},
+            start_new_session=True,  # Ctrl-C reaches the grid alone, which then ends its cells in order
+        )
+        processes.add(process)
+        assert process.stdout is not None
+        for line in process.stdout:
+            _listen(cell, line.strip())
+        cell.failed = process.wait() != 0
+        processes.discard(process)
+        cell.share, cell.note = 1.0, ""
+
+
+def _listen(cell: Cell, line: str) -> None:
+    """Take a cell's progress from a line that it printed. Sampling counts as the last tenth."""
+    if line:
+        cell.output.append(line)
+    if found := STEPS.match(line):
+        done = int(found[2]) / int(found[3])
+        cell.share = 0.9 * done if found[1] == "training" else 0.9 + 0.1 * done
+        cell.note = f"{found[1]} {found[2]}/{found[3]}"

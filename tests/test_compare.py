@@ -1,0 +1,129 @@
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from mlflow.entities import Metric
+from rich.console import Console
+from scipy import stats
+
+from conflow.experiment import compare, config, tracking
+from conflow.experiment.compare import COLLISIONS, QUALITIES, Comparison
+from conflow.experiment.config import ConfigError
+from conflow.experiment.metrics import wilson
+
+
+def add_run(ablation: str, seed: int, counts: int, quality: float, *arguments: str, status: str = "FINISHED") -> str:
+    """A run as training leaves it, with the same count of 1,000 trajectories in every setting."""
+    store = tracking.client()
+    experiment = store.get_experiment_by_name("conflow")
+    assert experiment is not None
+    settings = config.load(["preset=smoke", f"ablation={ablation}", f"seed={seed}", *arguments])
+    tags = {"ablation": ablation, "preset": "smoke", "seed": str(seed), "config_sha": settings.sha()}
+    run_id = store.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
+    values: dict[str, float] = {}
+    for group in ("test/none", "test/robot", "test/obstacle", "baseline/data", "baseline/source"):
+        values |= {f"{group}/num": 1000}
+        values |= {f"{group}/{name}_count": counts for name in ("robot_collision", "object_collision")}
+        values |= {f"{group}/{metric.rsplit('/', 1)[1]}": quality for metric in list(QUALITIES)[1:]}
+    store.log_batch(run_id, metrics=[Metric(key, value, 0, 0) for key, value in values.items()])
+    store.set_terminated(run_id, status)
+    return str(run_id)
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        monkeypatch.chdir(tmp_path_factory.mktemp("compared"))
+        for seed in range(4):
+            add_run("cgp", seed, 20 + seed, 0.01 + 0.001 * seed)
+            add_run("fm", seed, 40, 0.1)
+            add_run("fm_mixed", seed, 39, 0.1)
+            add_run("gaussian", seed, 10, 0.1 + 0.001 * seed)
+        add_run("cgp", 3, 999, 9.0, "train.max_steps=7")  # another config
+        add_run("cgp", 3, 999, 9.0, status="FAILED")
+        return compare.collect("smoke")
+
+
+def cell(comparison: Comparison, table: str, row: str, column: str) -> compare.Cell:
+    (found,) = [c for c in comparison.cells if (c.table, c.row, c.column) == (table, row, column)]
+    return found
+
+
+def test_rates_are_pooled_over_the_seeds_of_this_config_alone(comparison: Comparison) -> None:
+    found = cell(comparison, "1", "ConFlow (D+ and D-)", "none: robot")
+    assert (found.count, found.trajectories, found.seeds) == (20 + 21 + 22 + 23, 4000, 4)
+    assert (found.low, found.high) == wilson(86, 4000)
+    assert found.value == 86 / 4000
+    assert (found.seed_low, found.seed_high) == (0.020, 0.023)
+    assert found.paper == 0.016
+
+
+def test_other_metrics_are_means_over_seeds(comparison: Comparison) -> None:
+    found = cell(comparison, "2", "smoothness, median", "ConFlow (D+ and D-)")
+    assert found.value == pytest.approx(0.0115)
+    assert (found.seed_low, found.seed_high) == pytest.approx((0.010, 0.013))
+
+
+def test_the_data_are_counted_once_and_the_source_for_every_seed(comparison: Comparison) -> None:
+    assert cell(comparison, "1", "no model: test data", "none: robot").trajectories == 1000
+    assert cell(comparison, "1", "no model: source cgp", "none: robot").trajectories == 4000
+
+
+def test_claims_are_judged_by_exact_tests(comparison: Comparison) -> None:
+    verdicts = {claim.text: (claim.verdict, claim.p) for claim in comparison.claims}
+    p = stats.fisher_exact([[86, 3914], [160, 3840]]).pvalue
+    assert verdicts["ConFlow collides less than FM, without guidance"] == ("holds", p)
+    assert verdicts["naive negatives hurt FM, without guidance"][0] == "not distinguishable"
+    assert verdicts["CGP beats Gaussian: collision rate"][0] == "reversed"
+    assert verdicts["negatives help ConFlow (none: robot)"] == ("no runs", None)
+    # All four of one side below all four of the other: 2 of the 70 ways to deal eight seeds.
+    assert verdicts["CGP beats Gaussian: smoothness, median"] == ("holds", 2 / 70)
+
+
+def test_no_permutation_of_two_seeds_and_two_can_be_significant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    for seed in range(2):
+        add_run("cgp", seed, 10, 0.01)
+        add_run("gaussian", seed, 10, 0.9 + 0.01 * seed)
+    claims = {claim.text: claim for claim in compare.collect("smoke").claims}
+    found = claims["CGP beats Gaussian: smoothness, median"]
+    assert (found.verdict, found.p) == ("not distinguishable", 2 / 6)
+
+
+def rendered(comparison: Comparison, form: compare.Format) -> str:
+    console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    compare.render(comparison, form, console)
+    return console.export_text()
+
+
+def test_json_holds_everything_and_csv_every_cell(comparison: Comparison) -> None:
+    tree: Mapping[str, list[dict[str, object]]] = json.loads(rendered(comparison, "json"))
+    assert len(tree["cells"]) == len(comparison.cells)
+    assert tree["cells"][0]["value"] == comparison.cells[0].value
+    lines = rendered(comparison, "csv").splitlines()
+    assert len([line for line in lines if line.strip()]) == 1 + len(comparison.cells)
+
+
+@pytest.mark.parametrize("form", ["table", "markdown"])
+def test_a_rate_is_never_shown_without_interval_seeds_and_count(comparison: Comparison, form: compare.Format) -> None:
+    text = rendered(comparison, form)
+    low, high = wilson(86, 4000)
+    for shown in (f"0.0215 [{low:.4f}, {high:.4f}]", "seeds 0.0200 to 0.0230", "paper 0.016", "4 seeds, 4000 traj"):
+        assert shown in text
+
+
+def test_every_column_of_the_papers_first_table_has_its_cell(comparison: Comparison) -> None:
+    columns = {c.column for c in comparison.cells if c.table == "1" and c.row == "ConFlow (D+ and D-)"}
+    assert columns == set(COLLISIONS.values())
+
+
+def test_without_runs_the_way_to_some_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="preset=paper: no run at this preset has finished; try: make ablations"):
+        compare.collect("paper")

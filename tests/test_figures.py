@@ -1,0 +1,319 @@
+"""What the pictures show, read back from them and compared with numbers computed another way."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from mlflow.entities import Run
+from rich.console import Console
+from torch import Tensor
+
+from conflow.experiment import config, figures, tracking
+from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.diagnostics import guidance
+from conflow.experiment.evaluation import Evaluation
+from conflow.experiment.figures import curves, gallery, workspace
+from conflow.experiment.figures.animation import animation, frames
+from conflow.experiment.metrics import smoothness, wilson
+from conflow.experiment.module import SETTINGS, ConFlow
+from conflow.flow.sampler import integrate
+from tests.conftest import Command
+
+
+def model(*arguments: str) -> ConFlow:
+    torch.manual_seed(0)
+    return ConFlow(config.load(["preset=smoke", *arguments]), 32, 4)
+
+
+@pytest.fixture(scope="module")
+def data() -> DemonstrationData:
+    return DemonstrationData(config.load(["preset=smoke"]))
+
+
+@pytest.fixture(scope="module")
+def evaluation(data: DemonstrationData) -> Evaluation:
+    """Samples of an untrained model: those of the source, about, of which some collide."""
+    return gallery.sample(model("sample.robot_weight=2"), data)
+
+
+def lines(axis: Axes) -> Tensor:
+    """The trajectories drawn on an axis, (robots * shown, T, 2)."""
+    drawn = [c.get_segments() for c in axis.collections if isinstance(c, LineCollection)]
+    return torch.tensor([segment.tolist() for segments in drawn for segment in segments])
+
+
+def marks(axis: Axes) -> Tensor:
+    """Where collisions are marked, (number, 2)."""
+    *_, crosses = (c for c in axis.collections if isinstance(c, PathCollection))
+    return torch.tensor(np.array(crosses.get_offsets()), dtype=torch.float32)
+
+
+def curve(axis: Axes, label: str) -> tuple[list[float], list[float]]:
+    (line,) = [line for line in axis.lines if line.get_label() == label]
+    return np.array(line.get_xdata()).tolist(), np.array(line.get_ydata()).tolist()
+
+
+def sort(x: Tensor) -> Tensor:
+    """Rows in an order that does not depend on the one they came in."""
+    return torch.tensor(sorted(x.flatten(1).tolist()))
+
+
+def distance(x: Tensor) -> Tensor:
+    return (x[..., :2] - x[..., 2:]).norm(dim=-1)
+
+
+def test_demonstrations_are_drawn_apart_by_their_label(data: DemonstrationData) -> None:
+    feasible, colliding = figures.demonstrations(data).axes
+    for axis, violates in ((feasible, False), (colliding, True)):
+        x = data.x[data.violates == violates]
+        assert axis.get_title().endswith(f": {len(x)} of {len(data.x)}")
+        shown = x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
+        assert torch.equal(sort(lines(axis)), sort(shown))
+    assert len(marks(feasible)) == 0
+
+
+def test_a_collision_is_marked_between_the_robots_that_collide() -> None:
+    """Of three robots the second and the third, at the waypoint where they are closest."""
+    flow = ConFlow(config.load(["preset=smoke"]), 5, 6)
+    x = torch.tensor([-0.9, 0.9, 0.3, 0.0, -0.3, 0.0]).repeat(2, 5, 1)
+    x[0, 3] = torch.tensor([-0.9, 0.9, 0.5, 0.2, 0.5, 0.4])
+    figure = workspace._workspaces(1, 1)[0]
+    workspace._judged(figure.axes[0], x, flow.robots, "two")
+    assert figure.axes[0].get_title() == "two\n1 of 2 (50.0%) collide"
+    torch.testing.assert_close(marks(figure.axes[0]), torch.tensor([[0.5, 0.3]]))
+
+
+def test_the_sources_panel_shows_the_source_and_the_other_what_became_of_it(evaluation: Evaluation) -> None:
+    figure = figures.sources(model(), evaluation)
+    for axis, x in zip(figure.axes, (evaluation.source_samples, evaluation.samples["none"]), strict=True):
+        shown = x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
+        assert torch.equal(sort(lines(axis)), sort(shown))
+        assert f"\n{int((distance(x).amin(dim=1) < 0.3).sum())} of 512 " in axis.get_title()
+
+
+def test_the_page_judges_each_setting_by_what_it_avoids(data: DemonstrationData, evaluation: Evaluation) -> None:
+    flow = model()
+    axes = {axis.get_title().split("\n")[0]: axis for axis in figures.page(flow, data, evaluation).axes}
+    for setting in ("none", "robot"):
+        count = int((distance(evaluation.samples[setting]).amin(dim=1) < 0.3).sum())
+        assert f"\n{count} of 512 " in axes[workspace.TITLES[setting]].get_title()
+    obstacle = axes[workspace.TITLES["obstacle"]]
+    guided, unguided = (
+        (evaluation.samples[setting].unflatten(2, (2, 2)) - torch.tensor([0.0, 0.5])).norm(dim=3).amin(dim=(1, 2))
+        for setting in ("obstacle", "none")
+    )
+    assert f"\n{int((guided < 0.25).sum())} of 512 " in obstacle.get_title()
+    assert f"unguided: {int((unguided < 0.25).sum())} of 512 " in obstacle.get_xlabel()
+    circles = [patch for patch in obstacle.patches if isinstance(patch, Circle)]
+    assert [(circle.center, circle.radius) for circle in circles] == [((0.0, 0.5), 0.1), ((0.0, 0.5), 0.25)]
+    assert bool(((marks(obstacle) - torch.tensor([0.0, 0.5])).norm(dim=1) < 0.25).all())
+    assert len(marks(obstacle)) == int((guided[: workspace.SHOWN] < 0.25).sum())
+
+
+def test_the_frames_of_the_flow_are_its_states(evaluation: Evaluation) -> None:
+    """Ten steps of Euler written out, of which every second is a frame."""
+    flow, x_0 = model(), evaluation.source_samples
+    axes = workspace.flow(flow, x_0).axes
+    assert [axis.get_title().split("\n")[0] for axis in axes] == [f"$t = {t:g}$" for t in (0, 0.2, 0.4, 0.6, 0.8, 1)]
+    x = x_0
+    with torch.no_grad():
+        for k in range(11):
+            if k % 2 == 0:
+                shown = x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
+                torch.testing.assert_close(sort(lines(axes[k // 2])), sort(shown))
+            x = x + flow.v(x, torch.full((512,), k / 10)) / 10
+
+
+def test_the_distances_are_those_between_the_robots(evaluation: Evaluation) -> None:
+    for axis, setting in zip(workspace.distances(model(), evaluation).axes, SETTINGS, strict=True):
+        drawn = torch.tensor(np.array([line.get_ydata() for line in axis.lines if line.get_linestyle() == "-"]))
+        expected = distance(evaluation.samples[setting][: workspace.SHOWN])
+        torch.testing.assert_close(sort(drawn), sort(expected), rtol=0, atol=1e-6)  # float32
+        assert axis.lines[-1].get_ydata() == pytest.approx([0.3, 0.3])
+        assert "workspace units" in axis.get_ylabel() or setting != "none"
+
+
+def test_methods_gives_every_run_a_row(evaluation: Evaluation) -> None:
+    figure = workspace.methods([("first", model(), evaluation), ("second", model(), evaluation)])
+    assert len(figure.axes) == 6
+    assert [axis.get_ylabel().split("\n")[0] for axis in figure.axes[::3]] == ["first", "second"]
+    assert [axis.get_title() for axis in figure.axes[:3]] == [axis.get_title() for axis in figure.axes[3:]]
+
+
+def test_rates_over_the_weight_are_those_of_sampling_with_it(evaluation: Evaluation) -> None:
+    """Each point is a model with that weight in its config; the band is Wilson's."""
+    x_0 = evaluation.source_samples
+    axes = curves.guidance_weight(model("sample.robot_weight=0.5"), x_0).axes
+    weights, rates = curve(axes[0], "robot-collision rate")
+    assert weights == pytest.approx([0, 0.05, 0.5, 1.5, 5, 15, 50])
+    for weight, rate in zip(weights, rates, strict=True):
+        x = model(f"sample.robot_weight={weight}").flow(x_0, "robot")
+        assert rate * 512 == pytest.approx(int((distance(x).amin(dim=1) < 0.3).sum()))
+    assert rates[0] > rates[-1]
+    band = np.array(axes[0].collections[0].get_paths()[0].vertices)
+    for weight, rate in zip(weights, rates, strict=True):
+        at = band[np.isclose(band[:, 0], weight), 1]
+        assert (at.min(), at.max()) == pytest.approx(wilson(round(rate * 512), 512))
+    assert axes[0].lines[-1].get_xdata() == pytest.approx([0.5, 0.5])
+    assert "512" in axes[0].get_title()
+
+
+def test_a_config_without_guidance_still_gets_its_sweep(evaluation: Evaluation) -> None:
+    axis = curves.guidance_weight(model("sample.robot_weight=0"), evaluation.source_samples[:20]).axes[0]
+    assert curve(axis, "robot-collision rate")[0] == list(curves.FACTORS)
+
+
+def test_the_solvers_are_drawn_over_the_evaluations_that_they_spend(evaluation: Evaluation) -> None:
+    flow, x_0 = model(), evaluation.source_samples
+    rates, smooth = curves.solver_steps(flow, x_0).axes
+    for solver, each in (("euler", 1), ("midpoint", 2)):
+        evaluations, drawn = curve(rates, solver)
+        assert evaluations == list(curves.BUDGETS)
+        medians = curve(smooth, solver)[1]
+        for i in (0, 3):
+            x = integrate(flow.v, x_0, int(evaluations[i]) // each, "euler" if each == 1 else "midpoint")
+            assert drawn[i] * 512 == pytest.approx(int((distance(x).amin(dim=1) < 0.3).sum()))
+            assert medians[i] == pytest.approx(float(smoothness(x).quantile(0.5)))
+    assert rates.lines[-1].get_xdata() == pytest.approx([10, 10])  # preset smoke: 10 steps of Euler
+
+
+def test_the_guidance_figure_draws_what_was_measured(evaluation: Evaluation) -> None:
+    flow = model()
+    found = {setting: guidance(flow, setting, evaluation.source_samples) for setting in SETTINGS}
+    ratio, drift, robots, obstacle = curves.guidance(found).axes
+    for setting in SETTINGS:
+        label = curves.LABELS[setting]
+        assert curve(robots, label)[1] == found[setting].robot_barrier.tolist()
+        assert curve(obstacle, label)[1] == found[setting].obstacle_barrier.tolist()
+        if setting != "none":
+            assert curve(ratio, label)[1] == found[setting].ratio.tolist()
+    heights = [patch.get_height() for patch in drift.patches]  # type: ignore[attr-defined]
+    assert heights == [
+        value for setting in SETTINGS[1:] for value in (found[setting].start_drift, found[setting].end_drift)
+    ]
+
+
+def test_the_animation_needs_nothing_from_outside_and_holds_every_frame(evaluation: Evaluation) -> None:
+    flow = model()
+    page = animation(flow, evaluation, "a </script> name")
+    assert len(page.encode()) < 1_500_000
+    assert not re.search(r"https?:|\bsrc\s*=|\bhref\s*=|@import|url\(|\bimport\b|\bfetch\b", page)
+    assert page.count("</script>") == 1
+    content = json.loads(page.split("const content = ")[1].split(";\n")[0])
+    assert content["name"] == "a </script> name"
+    collides = distance(evaluation.samples["none"]).amin(dim=1) < 0.3
+    assert [": collides" in scene["label"] for scene in content["scenes"]] == [True, True, False, False]
+    for scene in content["scenes"]:
+        i = int(scene["label"].split(":")[0])
+        assert bool(collides[i]) == (": collides" in scene["label"])
+        for panel, setting in zip(scene["panels"], SETTINGS, strict=True):
+            x = evaluation.samples[setting][i]
+            positions, gap = torch.tensor(panel["positions"]), torch.tensor(panel["robotGap"])
+            fill = (len(positions) - 1) // 31
+            assert len(positions) == len(gap) == 31 * fill + 1 > 150
+            torch.testing.assert_close(positions[::fill].flatten(1), x, rtol=0, atol=6e-5)  # four digits
+            torch.testing.assert_close(gap, distance(positions.flatten(1)) - 0.3, rtol=0, atol=3e-4)
+            if ": collides" in scene["label"] and setting == "none":
+                assert float(gap.min()) < 0
+
+
+def test_frames_go_straight_from_waypoint_to_waypoint() -> None:
+    x = torch.tensor([[[0.0, 0], [1, 2], [1, 0]]])
+    filled = frames(x)[0]
+    assert torch.equal(filled[[0, 100, 200]], x[0])
+    torch.testing.assert_close(filled[[25, 150]], torch.tensor([[0.25, 0.5], [1.0, 1.0]]))
+
+
+def test_colliding_trajectories_are_missing_where_there_are_none(evaluation: Evaluation) -> None:
+    flow = model()
+    feasible = ~flow.robots.violation(evaluation.samples["none"])
+    apart = Evaluation(
+        evaluation.source_samples[feasible], {setting: x[feasible] for setting, x in evaluation.samples.items()}
+    )
+    scenes = json.loads(animation(flow, apart, "").split("const content = ")[1].split(";\n")[0])["scenes"]
+    assert [": collides" in scene["label"] for scene in scenes] == [False, False]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of its own: these runs have no metrics, which other tests of the shared one would miss."""
+    return tmp_path_factory.mktemp("place")
+
+
+@pytest.fixture
+def finished(place: Path, monkeypatch: pytest.MonkeyPatch, data: DemonstrationData, tmp_path: Path) -> Run:
+    """A finished run with an untrained model, and with a page that training drew."""
+    monkeypatch.chdir(place)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    flow = ConFlow(config.load(["preset=smoke", "seed=77"]), 32, 4)
+    checkpoint = {"state_dict": flow.state_dict()}
+    flow.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "page.png").write_bytes(b"of training")
+    with tracking.start(flow.config, data) as logger:
+        logger.store.log_artifacts(str(logger.run_id), str(tmp_path))
+    return tracking.find_run(str(logger.run_id))
+
+
+def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
+    finished: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workspace, "DPI", 20)
+    folder = Path("runs/figures/cgp-s77")
+    folder.mkdir(parents=True)
+    (folder / "mine.txt").write_text("kept")
+    (folder / "flow.png").write_text("of an earlier call")
+    gallery.draw(["cgp-s77"], Console(quiet=True))
+    written = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert written.pop("mine.txt") == b"kept"
+    pictures = {"demonstrations", "sources", "page", "flow", "distances", "guidance", "solver_steps", "guidance_weight"}
+    assert written.keys() == {f"{name}.png" for name in pictures} | {"animation.html"}
+    assert all(written[f"{name}.png"].startswith(b"\x89PNG") for name in pictures)
+    logged = {file.name: file.read_bytes() for file in tracking.artifact(finished, "figures").iterdir()}
+    assert logged.pop("page.png") == b"of training"
+    of_training = {"page.png", "demonstrations.png", "sources.png"}
+    assert logged == {name: written[name] for name in written.keys() - of_training}
+
+
+def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
+    finished: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[Path] = []
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: saved.append(path))
+    monkeypatch.setattr(gallery, "_log", lambda *_: None)
+    tracking.client().update_run(finished.info.run_id, name="../../elsewhere")
+    gallery.draw([finished.info.run_id, finished.info.run_id], Console(quiet=True))
+    assert {path.parent for path in saved} == {Path("runs/figures/_elsewhere"), Path("runs/figures")}
+    assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png"]
+
+
+def test_a_second_call_draws_the_same_samples(data: DemonstrationData, evaluation: Evaluation) -> None:
+    again = gallery.sample(model("sample.robot_weight=2"), data)
+    assert torch.equal(again.source_samples, evaluation.source_samples)
+    assert all(torch.equal(again.samples[setting], evaluation.samples[setting]) for setting in SETTINGS)
+    other = gallery.sample(model("sample.robot_weight=2", "seed=1"), data)
+    assert not torch.equal(other.source_samples, evaluation.source_samples)
+
+
+def test_a_mistyped_command_ends_in_one_line(conflow: Command) -> None:
+    result = conflow("figures", "runs=latest")
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
+    assert "expected run" in result.stderr
+
+
+def test_every_curve_says_what_it_shows_in_which_unit(evaluation: Evaluation) -> None:
+    flow, x_0 = model(), evaluation.source_samples[:20]
+    measured = {setting: guidance(flow, setting, x_0) for setting in SETTINGS}
+    for figure in (curves.solver_steps(flow, x_0), curves.guidance_weight(flow, x_0), curves.guidance(measured)):
+        for axis in figure.axes:
+            assert axis.get_title()
+            assert axis.get_xlabel() or [label.get_text() for label in axis.get_xticklabels()] == ["start", "goal"]
+            assert re.search("rate|workspace units|/", axis.get_ylabel())
