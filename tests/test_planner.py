@@ -1,0 +1,435 @@
+"""The planner with small untrained networks; where the network's output is zero, the flow stands still."""
+
+import math
+import pickle
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from conflow import __main__ as command_line
+from conflow.experiment import config, signals, tracking
+from conflow.experiment.build import fitted, random_stream
+from conflow.experiment.module import ConFlow
+from conflow.flow.source import Source, rbf
+from conflow.planner import PlanError, Planner, Plans, exact
+from conflow.scene.constraint import Obstacle
+from conflow.scene.trajectories import swap
+
+T, D = 32, 4
+START, GOAL = (-0.8, 0.0, 0.8, 0.0), (0.8, 0.0, -0.8, 0.0)
+VIA = [(0.5, (0.1, 0.6, -0.1, -0.6)), (0.26, (-0.3, 0.37, 0.41, -0.32))]
+DISC = (0.0, 0.0, 0.1)
+SOURCES = ("cgp", "gp", "gaussian")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """So small a network gains nothing from threads, and on a busy machine they wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def planner(*arguments: str, still: bool = False) -> Planner:
+    torch.manual_seed(0)
+    model = ConFlow(config.load(["preset=smoke", *arguments]), T, D)
+    if still:
+        torch.nn.init.zeros_(model.v.outlet.weight)
+        torch.nn.init.zeros_(model.v.outlet.bias)
+    return Planner(model)
+
+
+def save(model: ConFlow, path: Path) -> Path:
+    """What of a run's checkpoint is read."""
+    described = {"config": model.config.tree(), "T": model.T, "D": model.D}
+    torch.save({"conflow": described, "state_dict": model.state_dict()}, path)
+    return path
+
+
+def clearance(x: Tensor, obstacles: list[tuple[float, float, float]], radius: float = 0.3) -> float:
+    """The smallest gap of one trajectory (T, 4), waypoint by waypoint."""
+    gaps = []
+    for x1, y1, x2, y2 in x.tolist():
+        gaps.append(math.hypot(x1 - x2, y1 - y2) - radius)
+        gaps += [
+            math.hypot(px - ox, py - oy) - r - radius / 2 for px, py in ((x1, y1), (x2, y2)) for ox, oy, r in obstacles
+        ]
+    return min(gaps)
+
+
+@pytest.mark.parametrize("kind", SOURCES)
+@pytest.mark.parametrize("guidance", ["none", "both"])
+def test_start_goal_and_via_points_are_met_to_the_last_bit(kind: str, guidance: Any) -> None:
+    pairs = swap(3)
+    starts, goals = pairs[:, 0].double() / 3 * 3, pairs[:, -1]
+    x = planner(f"source.kind={kind}").plan(starts, goals, 5, [DISC], VIA, guidance).x
+    assert x.shape == (3, 5, T, D)
+    assert torch.equal(x[:, :, 0], starts.float()[:, None].expand(-1, 5, -1))
+    assert torch.equal(x[:, :, -1], goals[:, None].expand(-1, 5, -1))
+    for waypoint, (_, position) in zip((16, 8), VIA, strict=True):  # 0.5 * 31 and 0.26 * 31, rounded
+        assert torch.equal(x[:, :, waypoint], torch.tensor(position).expand(3, 5, -1))
+
+
+def test_a_via_point_next_to_an_end_falls_on_an_inner_waypoint() -> None:
+    first, last = (-0.75, 0.05, 0.75, 0.05), (0.75, 0.05, -0.75, 0.05)
+    plans = planner().plan(START, GOAL, 2, via=[(1e-6, first), (0.999, last)])
+    assert torch.equal(plans.x[:, 1], torch.tensor(first).expand(2, -1))
+    assert torch.equal(plans.x[:, -2], torch.tensor(last).expand(2, -1))
+
+
+def test_where_the_flow_stands_still_plans_are_samples_of_the_source_conditioned_on_the_request() -> None:
+    """And since nothing is missing at the waypoints, making them exact changes nothing."""
+    index = (0, 16, 8, -1)
+    y = torch.tensor([START, *(position for _, position in VIA), GOAL]).expand(50, -1, -1)
+    x_0 = Source(rbf(T, 0.4, 1.0, 1e-6), index).sample(y, random_stream("plan", 3))
+    x = planner(still=True).plan(START, GOAL, 50, via=VIA, guidance="none", seed=3).x
+    assert torch.equal(x.flatten(1).sort(dim=0).values, x_0.flatten(1).sort(dim=0).values)
+
+
+def test_exactness_adds_the_conditional_mean_of_what_is_missing() -> None:
+    """x + K_:O K_OO^-1 (y - x_O), solved densely here."""
+    K, index = rbf(T, 0.4, 1.0, 1e-6), [0, 10, 31]
+    x, y = torch.randn(6, T, D).double(), torch.randn(6, 3, D).double()
+    expected = x + K[:, index] @ K[index][:, index].inverse() @ (y - x[:, index])
+    # A 3 x 3 matrix with condition number about 10, in float64.
+    torch.testing.assert_close(exact(Source(K, index), x, y), expected, rtol=0, atol=1e-12)
+
+
+def test_the_smallest_motion_that_is_smooth_closes_the_gap() -> None:
+    """A gap of 1e-3 at one end is spread over its neighbours; of a Gaussian source that waypoint alone moves."""
+    x, gap = torch.zeros(1, T, D), torch.zeros(1, 2, D)
+    gap[:, 0] = 1e-3
+    smooth = exact(planner().model.source, x, gap)[0, :, 0]
+    assert bool((smooth[:8] > 1e-4).all())
+    assert bool((smooth.diff().abs() < 1e-4).all())
+    alone = exact(planner("source.kind=gaussian").model.source.condition((0, -1)), x, gap)
+    assert torch.equal(alone[:, 0], gap[:, 0])
+    assert not bool(alone[:, 1:].any())
+
+
+def test_feasible_plans_come_first_and_smoother_ones_before_rougher_ones() -> None:
+    plans = planner(still=True).plan(torch.tensor([START, GOAL]), torch.tensor([GOAL, START]), 200)
+    for pair in (plans[0], plans[1]):
+        count = int(pair.feasible.sum())
+        assert 20 < count < 180
+        assert bool(pair.feasible[:count].all())
+        for group in (pair.smoothness[:count], pair.smoothness[count:]):
+            assert bool((group.diff() >= 0).all())
+        assert torch.equal(pair.feasible, pair.clearance >= 0)
+
+
+def test_clearance_and_smoothness_are_those_of_the_trajectories_returned() -> None:
+    discs = [(0.0, 0.5, 0.1), (0.3, -0.4, 0.05)]
+    plans = planner(still=True).plan(START, GOAL, 20, [Obstacle(*discs[0]), discs[1]])
+    for x, c, rough in zip(plans.x, plans.clearance, plans.smoothness, strict=True):
+        # Single precision.
+        assert c.item() == pytest.approx(clearance(x, discs), abs=1e-6)
+        bends = [(x[i + 1] - 2 * x[i] + x[i - 1]).view(2, 2).norm(dim=1).mean() for i in range(1, T - 1)]
+        assert rough.item() == pytest.approx(float(torch.stack(bends).mean()), rel=1e-5)
+    without = planner(still=True).plan(START, GOAL, 20)
+    assert without.clearance[0].item() == pytest.approx(clearance(without.x[0], []), abs=1e-6)
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_a_pair_gets_the_same_plans_alone_and_in_a_batch(still: bool) -> None:
+    pairs, flow = swap(4), planner(still=still)
+    batch = flow.plan(pairs[:, 0], pairs[:, -1], 7, [Obstacle()])
+    assert batch.clearance.shape == batch.feasible.shape == batch.smoothness.shape == (4, 7)
+    for i in range(4):
+        single = flow.plan(pairs[i, 0], pairs[i, -1], 7, [Obstacle()])
+        assert single.x.shape == (7, T, D)
+        # Matrix products of other sizes round otherwise.
+        torch.testing.assert_close(single.x, batch[i].x, rtol=0, atol=1e-5)
+
+
+def test_one_call_of_the_network_serves_all_pairs_at_every_step() -> None:
+    flow, batches = planner(), []
+    flow.model.v.register_forward_hook(lambda _module, inputs, _output: batches.append(len(inputs[0])))
+    flow.plan(swap(3)[:, 0], swap(3)[:, -1], 5, [Obstacle()])
+    assert batches == [15] * flow.model.config.sample.steps
+
+
+def test_positions_may_come_as_lists_arrays_or_tensors() -> None:
+    flow = planner()
+    forms: list[Callable[[Any], Any]] = [list, np.array, np.single, torch.tensor]
+    results = [flow.plan(form(START), form(GOAL), 2).x for form in forms]
+    assert all(torch.equal(results[0], x) for x in results)
+    numbers: Any = np.int64(2), [], [(np.float32(0.5), START)]  # as NumPy gives them
+    assert flow.plan([-1, 0, 1, 0], (1, 0, -1, 0), *numbers).x.shape == (2, T, D)
+
+
+def test_guidance_moves_plans_away_from_what_it_avoids_and_in_proportion_to_its_weight() -> None:
+    flow, discs = planner(still=True), [(0.0, 0.5, 0.1), (0.0, -0.5, 0.1)]
+
+    def plan(**how: Any) -> Plans:
+        return flow.plan(START, GOAL, 60, **how)
+
+    robots = [plan(guidance="robot", robot_weight=weight).clearance.mean() for weight in (0, None, 3)]
+    assert robots[0] < robots[1] < robots[2]
+    obstacles = [
+        plan(guidance="obstacle", obstacles=discs, obstacle_weight=weight).clearance.mean() for weight in (0, 1, 3)
+    ]
+    assert obstacles[0] < obstacles[1] < obstacles[2]
+    assert flow.model.config.sample.obstacle_weight == 1
+    both = plan(guidance="both", obstacles=discs, robot_weight=3, obstacle_weight=3)
+    assert both.clearance.mean() > obstacles[2]
+
+
+def test_guidance_is_around_robots_always_and_around_obstacles_where_there_are_some() -> None:
+    flow = planner(still=True)
+    assert torch.equal(flow.plan(START, GOAL, 9).x, flow.plan(START, GOAL, 9, guidance="robot").x)
+    default = flow.plan(START, GOAL, 9, [Obstacle()])
+    assert torch.equal(default.x, flow.plan(START, GOAL, 9, [Obstacle()], guidance="both").x)
+    parts: tuple[Any, ...] = ("robot", "obstacle")
+    assert all(not torch.equal(default.x, flow.plan(START, GOAL, 9, [Obstacle()], guidance=part).x) for part in parts)
+    unguided = flow.plan(START, GOAL, 9, [Obstacle()], guidance="none")
+    assert torch.equal(unguided.x, flow.plan(START, GOAL, 9, [Obstacle()], guidance=None).x)
+    switched_off = flow.plan(START, GOAL, 9, [Obstacle()], robot_weight=0, obstacle_weight=0)
+    assert torch.equal(unguided.x, switched_off.x)
+
+
+def test_plans_are_a_function_of_the_request_and_the_seed() -> None:
+    flow = planner()
+    torch.manual_seed(1)
+    first = flow.plan(START, GOAL, 8, [DISC], VIA)
+    torch.manual_seed(2)
+    again = flow.plan(START, GOAL, 8, [DISC], VIA, seed=0)
+    assert torch.equal(first.x, again.x)
+    assert torch.equal(first.clearance, again.clearance)
+    assert not torch.equal(first.x, flow.plan(START, GOAL, 8, [DISC], VIA, seed=1).x)
+
+
+NAN, INF = float("nan"), float("inf")
+REQUEST: dict[str, Any] = {"start": START, "goal": GOAL, "num": 2}
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"start": (-1.2, 0, 0.8, 0)}, r"start=\(-1.2, 0, 0.8, 0\): expected finite .* workspace \[-1, 1\]"),
+        ({"goal": (0.8, 0, NAN, 0)}, r"goal=\(0.8, 0, nan, 0\): expected finite"),
+        ({"goal": (0.8, 0, -INF, 0)}, r"goal=.*-inf.*expected finite"),
+        ({"start": (0, 0, 0.2, 0)}, r"start=\(0, 0, 0.2, 0\): in collision with another robot"),
+        ({"goal": (0.5, 0.5, 0.5, 0.5)}, r"goal=.*in collision with another robot"),
+        ({"start": (0.8, 0)}, r"start=\(0.8, 0\): found shape \(2,\), expected numbers of shape \(4,\) or \(B, 4\)"),
+        ({"start": 0.8}, r"start=0.8: found shape \(\), expected"),
+        ({"start": np.zeros((1, 1, 4))}, r"start=.*found shape \(1, 1, 4\)"),
+        ({"start": np.zeros((0, 4)), "goal": np.zeros((0, 4))}, r"start=\[\]: found shape \(0, 4\)"),
+        ({"start": ("a", "b", "c", "d")}, r"start=\('a'.*expected numbers"),
+        ({"start": [[0.8, 0], [0.1]]}, r"start=\[\[0.8.*expected numbers"),
+        ({"start": None}, r"start=None: expected numbers"),
+        ({"start": (True, False, True, False)}, r"start=.*found torch.bool"),
+        ({"goal": np.array(GOAL) * 1j}, r"goal=.*found torch.complex"),
+        ({"start": [START, START]}, r"goal: found shape \(4,\), expected that of start, \(2, 4\)"),
+        ({"start": [START] * 3, "goal": [GOAL] * 2}, r"goal: found shape \(2, 4\), expected .* \(3, 4\)"),
+        ({"start": [START, (0, 0, 0, 2)], "goal": [GOAL] * 2}, r"start\[1\]=\(0, 0, 0, 2\): expected finite"),
+        ({"start": [START] * 2, "goal": [GOAL, (0, 0, 0, 0)]}, r"goal\[1\]=\(0, 0, 0, 0\): in collision"),
+        ({"num": 0}, r"num=0: expected a whole number of at least 1"),
+        ({"num": 2.0}, r"num=2.0: expected a whole number"),
+        ({"num": True}, r"num=True: expected a whole number"),
+        ({"seed": 0.5}, r"seed=0.5: expected a whole number of at least 0"),
+        ({"obstacles": [(-0.8, 0.1, 0.1)]}, r"start=.*in collision with obstacles\[0\]"),
+        ({"obstacles": [Obstacle(), Obstacle(0.8, 0.2, 0.1)]}, r"start=.*in collision with obstacles\[1\]"),
+        ({"obstacles": [(0.4, 0.5, 0)]}, r"obstacles\[0\]=\(0.4, 0.5, 0\): .* radius above 0"),
+        ({"obstacles": [(0.4, 0.5, -0.1)]}, r"obstacles\[0\]=.* radius above 0"),
+        ({"obstacles": [Obstacle(), Obstacle(0, 0, NAN)]}, r"obstacles\[1\]=\(0, 0, nan\): expected finite"),
+        ({"obstacles": [(0.4, INF, 0.1)]}, r"obstacles\[0\]=.*expected finite"),
+        ({"obstacles": [(0.4, 0.1)]}, r"obstacles\[0\]=\(0.4, 0.1\): found shape \(2,\), expected an Obstacle or"),
+        ({"obstacles": (0.4, 0.5, 0.1)}, r"obstacles\[0\]=0.4: found shape \(\), expected an Obstacle or"),
+        ({"obstacles": Obstacle()}, r"obstacles=Obstacle.*expected a sequence"),
+        ({"via": [(0, START)]}, r"via\[0\]: s=0, expected a number above 0 and below 1"),
+        ({"via": [(1.0, GOAL)]}, r"via\[0\]: s=1.0, expected"),
+        ({"via": [(NAN, GOAL)]}, r"via\[0\]: s=nan, expected"),
+        ({"via": [("0.5", GOAL)]}, r"via\[0\]: s=0.5, expected a number"),
+        ({"via": [(0.5, (0, 0, 0, 0.5)), (0.51, START)]}, r"via\[1\]: s=0.51 falls on waypoint 16 of 32 as via\[0\]"),
+        ({"via": [(0.5, (0, 0, 0, 1.5))]}, r"via\[0\]=\(0, 0, 0, 1.5\): expected finite"),
+        ({"via": [(0.5, [START])]}, r"via\[0\]=.*found shape \(1, 4\), expected numbers of shape \(4,\)$"),
+        ({"via": [(0.5, (0, 0, 0, 0.1))]}, r"via\[0\]=\(0, 0, 0, 0.1\): in collision with another robot"),
+        ({"via": [(0.3, (0, 0, 0, 0.5))], "obstacles": [Obstacle()]}, r"via\[0\]=.*in collision with obstacles\[0\]"),
+        ({"via": [0.5]}, r"via\[0\]=0.5: expected \(s, position\)"),
+        ({"via": 0.5}, r"via=0.5: expected a sequence"),
+        ({"guidance": "robots"}, r"guidance=robots: expected one of none, robot, obstacle, both; did you mean robot\?"),
+        ({"guidance": 0.08}, r"guidance=0.08: expected one of"),
+        ({"guidance": "obstacle"}, r"guidance=obstacle: expected obstacles to guide around, found none"),
+        ({"robot_weight": -1}, r"robot_weight=-1: expected a finite number of at least 0"),
+        ({"obstacle_weight": INF}, r"obstacle_weight=inf: expected a finite number of at least 0"),
+    ],
+)
+def test_a_bad_request_is_refused_in_one_line(changed: dict[str, Any], said: str) -> None:
+    with pytest.raises(PlanError, match=said) as refused:
+        planner(still=True).plan(**REQUEST | changed)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("kind", SOURCES)
+def test_a_checkpoint_plans_as_the_model_that_was_saved(kind: str, tmp_path: Path) -> None:
+    flow = planner(f"source.kind={kind}", "source.length_scale=0.3")
+    path = save(flow.model, tmp_path / "model.ckpt")
+    expected = flow.plan(START, GOAL, 4, [DISC], VIA).x
+    for given in (path, str(path)):
+        assert torch.equal(Planner.load(given).plan(START, GOAL, 4, [DISC], VIA).x, expected)
+
+
+def test_a_fitted_source_is_conditioned_on_via_points_with_its_own_kernel(tmp_path: Path) -> None:
+    model = ConFlow(fitted(config.load(["preset=smoke", "source.fit=true"]), swap(100)), T, D)
+    loaded = Planner.load(save(model, tmp_path / "model.ckpt"))
+    assert not torch.equal(loaded.model.source.prior, rbf(T, 0.4, 1.0, 1e-6))
+    assert torch.equal(
+        loaded.plan(START, GOAL, 4, via=VIA, seed=2).x, Planner(model).plan(START, GOAL, 4, via=VIA, seed=2).x
+    )
+
+
+class Trap:
+    """An object whose unpickling leaves a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.path,))
+
+
+def test_a_file_that_is_no_checkpoint_is_refused_in_one_line_and_never_executed(tmp_path: Path) -> None:
+    whole = save(planner().model, tmp_path / "whole.ckpt").read_bytes()
+    contents = {
+        "truncated": whole[: len(whole) // 2],
+        "empty": b"",
+        "text": b"not a checkpoint",
+        "pickle": pickle.dumps(Trap(tmp_path / "sprung")),
+    }
+    for name, content in contents.items():
+        (tmp_path / f"{name}.ckpt").write_bytes(content)
+    torch.save({"conflow": Trap(tmp_path / "sprung")}, tmp_path / "trap.ckpt")
+    torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
+    torch.save([1, 2], tmp_path / "list.ckpt")
+    described = {"config": planner().model.config.tree(), "T": T, "D": D}
+    torch.save({"conflow": described, "state_dict": {}}, tmp_path / "weightless.ckpt")
+    (tmp_path / "folder.ckpt").mkdir()
+    for name in (*contents, "trap", "foreign", "list", "weightless", "folder"):
+        with pytest.raises(PlanError) as refused:
+            Planner.load(tmp_path / f"{name}.ckpt")
+        assert str(refused.value) == (
+            f"run={tmp_path / name}.ckpt: expected the model.ckpt of a run of this version, "
+            "found a damaged or foreign file"
+        )
+    assert not (tmp_path / "sprung").exists()
+    with pytest.raises(PlanError, match=r"run=.*none.ckpt: no such file, expected the model.ckpt of a run"):
+        Planner.load(tmp_path / "none.ckpt")
+
+
+def test_a_run_is_found_by_its_name_its_id_or_as_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    flow = planner()
+    store = tracking.client()
+    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    assert experiment is not None
+    ids = [store.create_run(experiment.experiment_id, run_name=name).info.run_id for name in ("empty-s0", "cgp-s0")]
+    store.log_artifact(ids[1], str(save(flow.model, tmp_path / "model.ckpt")))
+    for run_id in ids:
+        store.set_terminated(run_id)
+    for wanted in ("cgp-s0", ids[1], "latest"):
+        assert torch.equal(Planner.load(wanted).plan(START, GOAL, 3).x, flow.plan(START, GOAL, 3).x)
+    with pytest.raises(PlanError, match=r"run=cpg-s0: no such finished run.*did you mean cgp-s0\?"):
+        Planner.load("cpg-s0")
+    with pytest.raises(PlanError, match=r"run=empty-s0: .*model.ckpt"):
+        Planner.load("empty-s0")
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def conflow_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """`python -m conflow sample ...` in a folder with a model.ckpt: exit code, output and error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(signals, "raise_on_signals", lambda: None)  # the tests' own process keeps its handlers
+    save(planner(still=True).model, tmp_path / "model.ckpt")
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["conflow", "sample", "run=./model.ckpt", *arguments])
+        code = 0
+        try:
+            command_line.main()
+        except SystemExit as stopped:
+            code = int(stopped.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+PAIR = ("start=-0.8,0,0.8,0", "goal=0.8,0,-0.8,0")
+
+
+def test_the_command_writes_plans_and_picture_and_says_how_many_are_feasible(
+    conflow_sample: Run, tmp_path: Path
+) -> None:
+    discs = ("obstacle=0,0.5,0.1", "obstacle=0.3,-0.4,0.05")
+    code, out, err = conflow_sample(*PAIR, "out=plans.npz", "num=40", *discs, "guidance=robot", "seed=3")
+    assert (code, err) == (0, "")
+    expected = Planner.load(tmp_path / "model.ckpt").plan(
+        START, GOAL, 40, [(0, 0.5, 0.1), (0.3, -0.4, 0.05)], guidance="robot", seed=3
+    )
+    with np.load("plans.npz") as file:
+        assert set(file) == {"x", "clearance", "feasible", "smoothness", "start", "goal"}
+        for name in ("x", "clearance", "feasible", "smoothness"):
+            assert np.array_equal(file[name], getattr(expected, name).numpy())
+        assert np.array_equal(file["start"], np.array(START, np.float32))
+        assert np.array_equal(file["goal"], file["x"][0, -1])
+    assert Path("plans.png").read_bytes().startswith(b"\x89PNG")
+    count = int(expected.feasible.sum())
+    # Wilson's interval, written out.
+    p, n, z = count / 40, 40, 1.959964
+    low, high = ((p + z**2 / 80 + s * z * math.sqrt(p * (1 - p) / n + z**2 / 6400)) / (1 + z**2 / n) for s in (-1, 1))
+    assert out == (
+        f"{count} of 40 plans are feasible, {p:.1%} (95 % interval {low:.1%} to {high:.1%}); "
+        f"best clearance {expected.clearance.max():.3f}\nWritten: plans.npz and plans.png\n"
+    )
+
+
+@pytest.mark.parametrize("existing", ["plans.npz", "plans.png"])
+def test_the_command_never_overwrites(existing: str, conflow_sample: Run) -> None:
+    Path(existing).write_text("precious")
+    code, out, err = conflow_sample(*PAIR)
+    assert (code, out) == (2, "")
+    assert err == f"conflow: out=plans.npz: expected a new file, found that {existing} exists already\n"
+    assert Path(existing).read_text() == "precious"
+    assert len(list(Path().glob("plans.*"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), 'start: expected .* found none; try: make sample START="-0.8,0,0.8,0" GOAL="0.8,0,-0.8,0"'),
+        (("start=-0.8,0,0.8,0", "goal="), "goal: expected .* found none; try: make sample"),
+        ((*PAIR, "obstcle=0,0,1"), r"obstcle: no such option.*did you mean obstacle\?"),
+        ((*PAIR, "here"), "here: expected key=value"),
+        (("start=-0.8;0", "goal=0,0"), "start=-0.8;0: expected numbers with commas between, such as -0.8,0,0.8,0"),
+        (("start=-0.8,0", "goal=0,0"), r"start=\[-0.8, 0.0\]: found shape \(2,\)"),
+        ((*PAIR, "obstacle=0,0.5"), r"obstacles\[0\]=\[0.0, 0.5\]: found shape \(2,\), expected .*radius"),
+        ((*PAIR, "num=0"), "num=0: expected a whole number of at least 1"),
+        ((*PAIR, "seed=-1"), "seed=-1: expected a whole number of at least 0"),
+        ((*PAIR, "guidance=booth"), r"guidance=booth: expected one of .*did you mean both\?"),
+        ((*PAIR, "out=plans.csv"), "out=plans.csv: expected a name that ends in .npz"),
+        ((*PAIR, "out=no/plans.npz"), "out=no/plans.npz: expected an existing folder, found no no"),
+        ((*PAIR, "run=./none.ckpt"), "run=./none.ckpt: no such file"),
+    ],
+)
+def test_a_bad_command_ends_in_one_line_and_writes_nothing(
+    arguments: tuple[str, ...], said: str, conflow_sample: Run
+) -> None:
+    code, out, err = conflow_sample(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("conflow: ")
+    assert err.count("\n") == 1
+    assert re.search(said, err)
+    assert [path.name for path in Path().iterdir()] == ["model.ckpt"]
