@@ -1,5 +1,6 @@
 """Every ablation for every seed: which cells are finished, which are to do, and a process for each that is."""
 
+import math
 import os
 import queue
 import re
@@ -86,7 +87,7 @@ def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
             while any(thread.is_alive() for thread in threads):
                 time.sleep(0.5)
                 busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
-                display.update(task, round(sum(cell.share for cell in cells), 1), busy)
+                display.update(task, math.floor(10 * sum(cell.share for cell in cells)) / 10, busy)
         except BaseException:
             while not waiting.empty():
                 waiting.get()
