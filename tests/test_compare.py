@@ -22,7 +22,7 @@ def add_run(ablation: str, seed: int, counts: int, quality: float, *arguments: s
     tags = {"ablation": ablation, "preset": "smoke", "seed": str(seed), "config_sha": settings.sha()}
     run_id = store.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
     values: dict[str, float] = {}
-    for group in ("test/none", "test/robot", "test/obstacle", "baseline/data", "baseline/source"):
+    for group in ("test/none", "test/robot", "test/obstacle", "without_model/data", "without_model/source"):
         values |= {f"{group}/num": 1000}
         values |= {f"{group}/{name}_count": counts for name in ("robot_collision", "object_collision")}
         values |= {f"{group}/{metric.rsplit('/', 1)[1]}": quality for metric in list(QUALITIES)[1:]}

@@ -207,7 +207,7 @@ _UNGUIDED = [(key, column) for key, column in COLLISIONS.items() if key.startswi
 
 
 def _baseline(key: str, of: str) -> str:
-    return key.replace("test/none/", f"baseline/{of}/")
+    return key.replace("test/none/", f"without_model/{of}/")
 
 
 def _table_2(runs: Mapping[str, list[Run]]) -> list[Cell]:

@@ -37,7 +37,7 @@ class Evaluation:
         """The metrics under their names in MLflow."""
         groups = {f"{prefix}{setting}": metrics for setting, metrics in self.results.items()}
         if baseline:
-            groups |= {f"baseline/{name}": metrics for name, metrics in self.baseline.items()}
+            groups |= {f"without_model/{name}": metrics for name, metrics in self.baseline.items()}
         return {f"{group}/{name}": value for group, metrics in groups.items() for name, value in metrics.items()}
 
 

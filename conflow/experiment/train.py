@@ -33,8 +33,9 @@ def train(config: Config, console: Console) -> str:
     model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
     with tracking.start(config, data) as logger:
         run_id = str(logger.run_id)
-        kernel = model.config.source
-        logger.log_metrics({"source/length_scale": kernel.length_scale, "source/sigma_f": kernel.sigma_f}, 0)
+        if config.source.fit:
+            kernel = model.config.source
+            logger.log_metrics({"source/length_scale": kernel.length_scale, "source/sigma_f": kernel.sigma_f}, 0)
         with ProgressDisplay(console) as display:
             evaluation = Evaluate(data, display)
             callbacks = [evaluation, TrainingLog(config.train.log_every), TrainingProgress(display)]
