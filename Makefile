@@ -10,19 +10,21 @@ RUN      ?= latest
 FORMAT   ?= table
 START    ?=
 GOAL     ?=
-OUT      ?= plans.npz
-NUM      ?= 64
+# Of these two every command has its own default.
+OUT      ?=
+NUM      ?=
 PORT     ?= 5000
 ARGS     ?=
 
 PYTHON := .venv/bin/python
 CONFLOW = $(PYTHON) -m conflow
+WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
-.PHONY: help train ablations evaluate compare sample figures ui test lint lock
+.PHONY: help train ablations evaluate compare sample figures demonstrations ui test lint lock
 
 help:  ## List what can be made
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
 	@echo '  Variables: ABLATION=$(ABLATION) SEED=$(SEED) PRESET=$(PRESET) PORT=$(PORT) ARGS="key=value ..."'
 	@echo "  Ablations: $(basename $(notdir $(wildcard conf/ablation/*.yaml)))"
 	@echo "  Presets:   $(basename $(notdir $(wildcard conf/preset/*.yaml)))"
@@ -40,10 +42,13 @@ compare: .venv/installed  ## Print the paper's tables and claims from finished r
 	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(ARGS)
 
 sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= SEED= ARGS="obstacle=x,y,r"
-	@$(CONFLOW) sample run=$(RUN) start="$(START)" goal="$(GOAL)" out="$(OUT)" num=$(NUM) seed=$(SEED) $(ARGS)
+	@$(CONFLOW) sample run=$(RUN) start="$(START)" goal="$(GOAL)" $(WRITTEN) seed=$(SEED) $(ARGS)
 
 figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,...
 	@$(CONFLOW) figures run=$(RUN)
+
+demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": OUT= NUM= SEED=
+	@$(CONFLOW) demonstrations $(WRITTEN) seed=$(SEED)
 
 ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
 	@$(CONFLOW) ui port=$(PORT)

@@ -95,6 +95,20 @@ def figures(arguments: list[str]) -> None:
     gallery.draw(options["run"].split(","), _console())
 
 
+def demonstrations(arguments: list[str]) -> None:
+    """Write demonstrations that bulge where the robots pass, for data.path: out=passing.npz num=3000 seed=0."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    options, _ = config.options(arguments, {"out": "passing.npz", "num": "3000", "seed": "0"}, settings=False)
+    num, seed = config.whole(options, "num", 10, 10**5), config.whole(options, "seed", 0, 2**32 - 1)
+
+    from conflow.scene.trajectories import passing, save
+
+    save(options["out"], passing(num, seed=seed))
+    print(f"Written: {options['out']}; train on it with: make train ARGS=data.path={options['out']}")
+
+
 def ui(arguments: list[str]) -> None:
     """Serve MLflow's pages of all runs on this machine: port=5000."""
     from conflow.experiment import config
@@ -114,6 +128,7 @@ COMMANDS = {
     "compare": compare,
     "sample": sample,
     "figures": figures,
+    "demonstrations": demonstrations,
     "ui": ui,
 }
 

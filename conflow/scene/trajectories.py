@@ -1,7 +1,8 @@
 """Demonstrations of the two-robot swap: generator, files, and what makes them valid (paper: "Task Description")."""
 
 import hashlib
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,12 @@ from torch import Tensor
 
 # The two robots' nominal starts; each one's goal is the other's start.
 SIDES = ((-0.8, 0.0), (0.8, 0.0))
+
+# Amplitudes of the speed's harmonics in `passing`: a robot's speed stays between 0.2 and 1.8 of its mean.
+WARP = (0.3, 0.4, 0.1)
+
+# What `passing` keeps away from the radius, so that rounding to float32 changes no label.
+MARGIN = 1e-3
 
 
 class DemonstrationError(ValueError):
@@ -34,23 +41,110 @@ def swap(
     are jittered uniformly by +-jitter. Of the defaults' trajectories 30 % come closer than 0.3.
     """
     generator = torch.Generator().manual_seed(seed)
+    a = _uniform(generator, num, 2, len(amplitudes)) * torch.tensor(amplitudes)
+    p, q = _ends(num, jitter, generator)
+    s = torch.linspace(0, 1, T, dtype=torch.float64).float()
+    return _trajectories(p, q, s, a @ _harmonics(len(amplitudes), T).float())
 
-    def uniform(*shape: int) -> Tensor:
-        return 2 * torch.rand(*shape, generator=generator) - 1
 
-    s = torch.linspace(0, 1, T, dtype=torch.float64)
-    k = torch.arange(1, len(amplitudes) + 1)
-    harmonics = torch.sin(torch.pi * k[:, None] * s)
-    harmonics[:, -1] = 0  # sin(k pi) in floating point is not
-    a = uniform(num, 2, len(amplitudes)) * torch.tensor(amplitudes)
+def passing(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor:
+    """Two robots that swap sides at varying speed and bulge where they pass, x (num, T, 4) as (x1, y1, x2, y2).
+
+    A robot goes along its straight line, as in `swap`, with s a smooth monotone function of time, another one for each
+    robot. Orthogonal to travel it deviates by +-h b (1 + cos(pi (s - c) / w)) / 2 where |s - c| < w, else by 0: c is
+    where the straight lines come closest, w is uniform in [0.25, 0.35], and the robots' shares b, uniform in
+    [0.3, 0.7], add up to 1. Of the trajectories 65 % pass on the right, the others on the left.
+
+    h gives the smallest distance over waypoints its distribution: for 60 % uniform in [radius, 1.2 radius], for 40 %,
+    which collide, uniform between that of the straight lines and `radius`. All keep MARGIN from `radius`.
+
+    Raises:
+        DemonstrationError: straight lines do not collide, since `radius` or T is too small.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    p, q = (end.double() for end in _ends(num, 0.04, generator))
+    s = _warped(num, T, generator)
+    straight = _trajectories(p, q, s, torch.zeros_like(s))
+    closest = _distances(straight).min(dim=1)
+    c = s.take_along_dim(closest.indices[:, None, None], dim=2)
+    w = 0.3 + 0.05 * _uniform(generator, num, 2, 1).double()
+    share = 0.5 + 0.2 * _uniform(generator, num, 1, 1).double() * torch.tensor([[1.0], [-1.0]])
+    side = torch.where(_some(0.65, num, generator), -1.0, 1.0)[:, None, None]
+    bump = side * share * (1 + torch.cos(torch.pi * ((s - c) / w).clamp(-1, 1))) / 2
+    bend = _trajectories(p, q, s, bump) - straight
+
+    def bent(h: Tensor) -> Tensor:
+        return straight + h[:, None, None] * bend
+
+    wanted = _wanted(closest.values, radius, generator)
+    return bent(_bisection(lambda h: _distances(bent(h)).amin(dim=1), wanted, 3 * radius)).float()
+
+
+def _uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    return 2 * torch.rand(*shape, generator=generator) - 1
+
+
+def _some(share: float, num: int, generator: torch.Generator) -> Tensor:
+    """A share of `num`, to the nearest whole number, drawn by chance: boolean (num,)."""
+    return torch.randperm(num, generator=generator) < round(share * num)
+
+
+def _ends(num: int, jitter: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Starts p and goals q of both robots, (num, 2, 2) each."""
     sides = torch.tensor(SIDES)
-    p = sides + jitter * uniform(num, 2, 2)
-    q = sides.flip(0) + jitter * uniform(num, 2, 2)
+    p = sides + jitter * _uniform(generator, num, 2, 2)
+    return p, sides.flip(0) + jitter * _uniform(generator, num, 2, 2)
+
+
+def _harmonics(count: int, T: int) -> Tensor:
+    """sin(k pi s) for k = 1, ..., count, (count, T), zero at both ends."""
+    s = torch.linspace(0, 1, T, dtype=torch.float64)
+    harmonics = torch.sin(torch.pi * torch.arange(1, count + 1)[:, None] * s)
+    harmonics[:, -1] = 0  # sin(k pi) in floating point is not
+    return harmonics
+
+
+def _warped(num: int, T: int, generator: torch.Generator) -> Tensor:
+    """s(t) = t + sum_k a_k sin(k pi t) / (k pi) of both robots, (num, 2, T), with a_k uniform in +-WARP[k-1]."""
+    a = _uniform(generator, num, 2, len(WARP)).double() * torch.tensor(WARP)
+    rate = torch.pi * torch.arange(1, len(WARP) + 1)
+    return torch.linspace(0, 1, T, dtype=torch.float64) + (a / rate) @ _harmonics(len(WARP), T)
+
+
+def _trajectories(p: Tensor, q: Tensor, s: Tensor, deviation: Tensor) -> Tensor:
+    """p + s (q - p) + deviation n, (num, T, 4), with n the unit normal to the left of travel; s (T,) or (num, 2, T)."""
     travel = q - p
     n = torch.stack([-travel[..., 1], travel[..., 0]], dim=-1) / torch.linalg.vector_norm(travel, dim=-1, keepdim=True)
-    deviation = (a @ harmonics.float())[..., None]
-    line = torch.lerp(p[:, :, None], q[:, :, None], s.float()[:, None])
-    return (line + deviation * n[:, :, None]).transpose(1, 2).flatten(2)
+    line = torch.lerp(p[:, :, None], q[:, :, None], s[..., None])
+    return (line + deviation[..., None] * n[:, :, None]).transpose(1, 2).flatten(2)
+
+
+def _distances(x: Tensor) -> Tensor:
+    """The distance of two robots at every waypoint of x (num, T, 4), (num, T)."""
+    return torch.linalg.vector_norm(x[..., :2] - x[..., 2:], dim=2)
+
+
+def _wanted(straight: Tensor, radius: float, generator: torch.Generator) -> Tensor:
+    """The smallest distances that `passing` promises, (num,), for those of the straight lines, which are below."""
+    inside, outside = radius - MARGIN, radius + MARGIN
+    if bool((straight >= inside).any()):
+        raise DemonstrationError(
+            f"radius={radius}: straight lines keep a distance of up to {float(straight.max()):.3f} at waypoints, "
+            f"expected less than {inside:.3f}"
+        )
+    share = torch.rand(len(straight), generator=generator).double()
+    collides = _some(0.4, len(straight), generator)
+    return torch.where(collides, straight + share * (inside - straight), outside + share * (1.2 * radius - outside))
+
+
+def _bisection(f: Callable[[Tensor], Tensor], wanted: Tensor, high: float) -> Tensor:
+    """h (num,) with f(h) = wanted to rounding, for a continuous f with f(0) <= wanted <= f(high)."""
+    low, up = torch.zeros_like(wanted), torch.full_like(wanted, high)
+    for _ in range(40):
+        middle = (low + up) / 2
+        below = f(middle) < wanted
+        low, up = torch.where(below, middle, low), torch.where(below, up, middle)
+    return up
 
 
 def load(path: str | Path) -> Demonstrations:
@@ -106,6 +200,24 @@ def check(x: Tensor, name: str) -> None:
             f"{name}: {int(outside.sum())} trajectories leave the workspace [-1, 1], the first is "
             f"{int(outside.nonzero()[0])}"
         )
+
+
+def save(path: str | Path, x: Tensor) -> None:
+    """Write trajectories x (N, T, D) as a new .npz file that `load` reads, whole or not at all.
+
+    Raises:
+        DemonstrationError: the name does not end in .npz, there is such a file, or it cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise DemonstrationError(f"out={path}: expected a name that ends in .npz")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".conflow-", dir=path.parent) as folder:
+            part = Path(folder, path.name)
+            np.savez(part, x=x.numpy())
+            path.hardlink_to(part)  # which, unlike a rename, refuses to replace a file
+    except OSError as error:
+        raise DemonstrationError(f"out={path}: {error.strerror}, expected a new file in an existing folder") from None
 
 
 def digest(x: Tensor) -> str:

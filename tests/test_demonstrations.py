@@ -1,0 +1,258 @@
+"""Demonstrations of another kind: the generated passing, the file it is written to, and the command."""
+
+import errno
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from conflow import __main__ as command_line
+from conflow.experiment import config, signals
+from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.metrics import smoothness
+from conflow.scene.trajectories import SIDES, DemonstrationError, check, digest, load, passing, save, swap
+
+
+def nearest(x: Tensor) -> Tensor:
+    """The robots' smallest distance over waypoints of x (num, T, 4), (num,)."""
+    return (x[..., :2] - x[..., 2:]).norm(dim=2).amin(dim=1)
+
+
+def along_and_across(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Progress from 0 to 1 along each robot's straight line, and deviation to its left, (num, 2, T) each."""
+    paths = x.double().unflatten(2, (2, 2)).transpose(1, 2)
+    travel = paths[:, :, -1:] - paths[:, :, :1]
+    off, length = paths - paths[:, :, :1], travel.norm(dim=3)
+    left = torch.stack([-travel[..., 1], travel[..., 0]], dim=-1)
+    return (off * travel).sum(dim=3) / length**2, (off * left).sum(dim=3) / length
+
+
+@pytest.mark.parametrize(
+    ("num", "T", "seed", "radius"),
+    [(3000, 32, 0, 0.3), (3000, 32, 1, 0.3), (30_000, 32, 2, 0.3), (3000, 24, 3, 0.3), (3000, 64, 4, 0.4)],
+)
+def test_forty_percent_collide_and_the_others_pass_barely_outside(num: int, T: int, seed: int, radius: float) -> None:
+    """Of the smallest distances 40 % lie below the radius, 60 % uniformly in [radius, 1.2 radius], none at it."""
+    distance = nearest(passing(num, T, seed, radius))
+    collides = distance < radius
+    assert int(collides.sum()) == round(0.4 * num)
+    # 1e-3 away, but for float32 rounding
+    assert float((distance - radius).abs().min()) > 0.999e-3
+    share = (distance[~collides] - radius) / (0.2 * radius)
+    assert float(share.max()) < 1 + 1e-5
+    # Quantiles of 1800 uniform draws and more: four standard errors are at most 0.047.
+    levels = torch.tensor([0.1, 0.25, 0.5, 0.75, 0.9])
+    torch.testing.assert_close(share.quantile(levels), levels, rtol=0, atol=0.06)
+    # From the straight lines' distances, of which most are below a third of the radius, evenly up to the radius.
+    below = distance[collides] / radius
+    assert float(below.min()) < 0.1
+    assert 0.5 < float(below.median()) < 0.65
+    assert float(below.max()) > 0.98
+
+
+def test_they_are_demonstrations_as_good_as_swaps() -> None:
+    """Inside the workspace, finite, in float32, with starts and goals at the jittered sides, and about as smooth."""
+    x = passing(5000)
+    assert x.dtype == torch.float32
+    assert x.shape == (5000, 32, 4)
+    check(x, "generated")
+    sides = torch.tensor(SIDES)
+    for ends, nominal in ((x[:, 0], sides), (x[:, -1], sides.flip(0))):
+        off = (ends.unflatten(1, (2, 2)) - nominal).abs()
+        # float32 rounding of a coordinate below 1; 5000 draws miss 1 % of their range but for a chance of 1e-22
+        assert bool((off <= 0.04 + 1e-7).all())
+        assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
+    ratio = smoothness(x).quantile(0.5) / smoothness(swap(5000)).quantile(0.5)
+    assert 1 / 2 < float(ratio) < 2
+
+
+def test_the_ends_do_not_depend_on_the_bulge() -> None:
+    """Of any bulge, starts and goals are the same to the last bit, and next to them the path is straight."""
+    x, wider = passing(1000, radius=0.3), passing(1000, radius=0.4)
+    assert torch.equal(x[:, [0, -1]], wider[:, [0, -1]])
+    assert float((x - wider).abs().amax()) > 0.05
+    progress, deviation = along_and_across(x)
+    # float32 rounding
+    assert float(deviation[(progress < 0.02) | (progress > 0.98)].abs().max()) < 3e-7
+
+
+def test_progress_is_monotone_and_speed_varies_by_robot_and_trajectory() -> None:
+    """The speed along the line stays between 0.2 and 1.8 of its mean, and mostly changes by half of it or more."""
+    progress, _ = along_and_across(passing(3000))
+    speed = progress.diff(dim=2) * 31
+    assert float(speed.min()) > 0.2
+    assert float(speed.max()) < 1.8
+    ratio = speed.amax(dim=2) / speed.amin(dim=2)
+    assert float((ratio > 1.5).double().mean()) > 0.7
+    # At half-time progress is 1/2 +- (0.3 - 0.1 / 3) / pi at random, in either robot for itself.
+    half = (progress[:, :, 15] + progress[:, :, 16]) / 2
+    assert float(half.std()) == pytest.approx(((0.3**2 + (0.1 / 3) ** 2) / 3) ** 0.5 / torch.pi, rel=0.05)
+    assert abs(float(torch.corrcoef(half.mT)[0, 1])) < 4 / 3000**0.5
+
+
+def test_the_bulge_is_a_raised_cosine_where_the_robots_pass() -> None:
+    """|deviation| = height (1 + cos(pi (s - c) / w)) / 2, w in [0.25, 0.35], c where the straight lines come closest.
+
+    The two heights are shares in [0.3, 0.7] of their sum, to the right of travel for 65 %, independently of collision.
+    """
+    x = passing(5000, seed=1)
+    s, deviation = along_and_across(x)
+    height, where = deviation.abs().max(dim=2)
+    assert torch.equal(where[:, 0], where[:, 1])
+    p, q = x.double()[:, :1], x.double()[:, -1:]
+    line = p + s.transpose(1, 2).repeat_interleave(2, dim=2) * (q - p)
+    closest = (line[..., :2] - line[..., 2:]).norm(dim=2).argmin(dim=1)
+    tall = (height > 0.02).all(dim=1)
+    assert torch.equal(where[tall, 0], closest[tall])
+
+    c = s.take_along_dim(where[..., None], dim=2)
+    value = deviation.abs() / height[..., None]
+    w = torch.pi * (s - c).abs() / torch.acos((2 * value - 1).clamp(-1, 1))
+    flank = (value > 0.1) & (value < 0.9) & tall[:, None, None]
+    # float32 rounding of 1e-7 in a height of 0.02 and more, of which the arc cosine makes threefold
+    assert float(w[flank].min()) > 0.25 - 1e-4
+    assert float(w[flank].max()) < 0.35 + 1e-4
+    assert float(w[flank].max() - w[flank].min()) > 0.099
+    assert float((w.where(flank, 0.0).amax(dim=2) - w.where(flank, 1.0).amin(dim=2)).max()) < 1e-4
+
+    share = (height / height.sum(dim=1, keepdim=True))[tall]
+    assert 0.3 - 1e-5 < float(share.min()) < 0.302
+    right = deviation.take_along_dim(where[..., None], dim=2)[..., 0] < 0
+    assert torch.equal(right[:, 0], right[:, 1])
+    assert int(right[:, 0].sum()) == 3250
+    # Four standard errors
+    assert float(right[nearest(x) < 0.3, 0].double().mean()) == pytest.approx(0.65, abs=4 * (0.65 * 0.35 / 2000) ** 0.5)
+
+
+def test_a_seed_is_a_data_set() -> None:
+    """The same seed gives the same bytes, whatever happens to the global generator; another one differs."""
+    x = passing(50, seed=7)
+    torch.manual_seed(0)
+    assert digest(passing(50, seed=7)) == digest(x)
+    assert not bool((passing(50, seed=8)[:, 0] == x[:, 0]).any())
+
+
+@pytest.mark.parametrize(("T", "radius"), [(4, 0.3), (32, 0.05)])
+def test_what_cannot_be_had_is_refused(T: int, radius: float) -> None:
+    """Where not even straight lines collide at a waypoint, no 40 % can."""
+    with pytest.raises(DemonstrationError, match=f"^radius={radius}: straight lines keep a distance .* expected less"):
+        passing(1000, T, radius=radius)
+
+
+def test_a_file_is_read_back_to_the_last_bit_and_trained_on(tmp_path: Path) -> None:
+    """`load` finds x and no labels, so the experiment computes them: 40 % violate its own threshold."""
+    path = tmp_path / "passing.npz"
+    x = passing(500)
+    save(path, x)
+    loaded = load(path)
+    assert torch.equal(loaded.x, x)
+    assert loaded.violates is None
+    data = DemonstrationData(config.load(["preset=smoke", f"data.path={path}"]))
+    assert torch.equal(data.violates, nearest(x) < 0.3)
+    assert int(data.violates.sum()) == 200
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When the disk is full half-way, neither the file nor a part of it stays."""
+
+    def full(path: Path, **arrays: Any) -> None:
+        path.write_bytes(b"PK")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(DemonstrationError, match=r"passing.npz: No space left on device, expected a new file"):
+        save(tmp_path / "passing.npz", passing(10))
+    assert not list(tmp_path.iterdir())
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def demonstrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """`python -m conflow demonstrations ...` in an empty folder: exit code, output and error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(signals, "raise_on_signals", lambda: None)  # the tests' own process keeps its handlers
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["conflow", "demonstrations", *arguments])
+        code = 0
+        try:
+            command_line.main()
+        except SystemExit as stopped:
+            code = int(stopped.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "num", "seed"),
+    [((), "passing.npz", 3000, 0), (("out=other.npz", "num=50", "seed=3"), "other.npz", 50, 3)],
+)
+def test_the_command_writes_what_it_says(
+    arguments: tuple[str, ...], name: str, num: int, seed: int, demonstrations: Run
+) -> None:
+    code, out, err = demonstrations(*arguments)
+    assert (code, err) == (0, "")
+    assert out == f"Written: {name}; train on it with: make train ARGS=data.path={name}\n"
+    assert [path.name for path in Path().iterdir()] == [name]
+    assert torch.equal(load(name).x, passing(num, seed=seed))
+
+
+def test_the_command_never_overwrites(demonstrations: Run) -> None:
+    Path("passing.npz").write_text("precious")
+    code, out, err = demonstrations("num=10")
+    assert (code, out) == (2, "")
+    assert err == "conflow: out=passing.npz: File exists, expected a new file in an existing folder\n"
+    assert [path.name for path in Path().iterdir()] == ["passing.npz"]
+    assert Path("passing.npz").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("out=no/passing.npz", "out=no/passing.npz: No such file or directory, expected a new file in an existing fol"),
+        ("out=passing.csv", "out=passing.csv: expected a name that ends in .npz"),
+        (f"out={'a' * 300}.npz", f"out={'a' * 300}.npz: File name too long, expected"),
+        ("num=9", "num=9: expected a whole number of at least 10 and at most 100000"),
+        ("num=many", "num=many: expected a whole number"),
+        ("seed=-1", "seed=-1: expected a whole number of at least 0"),
+        ("sed=1", "sed: no such option, expected out, num, seed; did you mean seed?"),
+        ("passing.npz", "passing.npz: expected key=value"),
+    ],
+)
+def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: str, demonstrations: Run) -> None:
+    code, out, err = demonstrations("num=10", argument)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"conflow: {said}")
+    assert err.count("\n") == 1
+    assert not list(Path().iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("demonstrations", "OUT=a b.npz", "NUM=50", "SEED=3"), ["demonstrations", "out=a b.npz", "num=50", "seed=3"]),
+        (("demonstrations",), ["demonstrations", "seed=0"]),
+        (("sample", "OUT=a.npz", "NUM=7"), ["sample", "run=latest", "start=", "goal=", "out=a.npz", "num=7", "seed=0"]),
+        (("sample",), ["sample", "run=latest", "start=", "goal=", "seed=0"]),
+    ],
+)
+def test_make_passes_on_what_is_given(arguments: tuple[str, ...], expected: list[str]) -> None:
+    """Without OUT and NUM the command's own defaults hold. The command is echoed instead of run."""
+    command = ["make", "--silent", "--old-file=.venv/installed", "CONFLOW=printf '%s\\n'", *arguments]
+    # Not the variables of a `make test` around this.
+    environment = {"PATH": os.environ["PATH"]}
+    finished = subprocess.run(
+        command, cwd=config.CONF.parent, env=environment, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert finished.stdout.splitlines() == expected
