@@ -1,6 +1,8 @@
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from mlflow.entities import Metric
@@ -8,13 +10,28 @@ from rich.console import Console
 from scipy import stats
 
 from conflow.experiment import compare, config, tracking
-from conflow.experiment.compare import COLLISIONS, QUALITIES, Comparison
+from conflow.experiment.compare import COLLISIONS, GUARDS, QUALITIES, Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
 
+GROUPS = ("test/none", "test/robot", "test/obstacle", *(f"without_model/{of}" for of in ("data", "feasible", "source")))
+RATES = ("robot_collision", "object_collision", "success", "outside")
+OTHERS = {key.rsplit("/", 1)[1] for key in (*QUALITIES, *GUARDS)} - {*RATES}
 
-def add_run(ablation: str, seed: int, counts: int, quality: float, *arguments: str, status: str = "FINISHED") -> str:
-    """A run as training leaves it, with the same count of 1,000 trajectories in every setting."""
+
+def add_run(
+    ablation: str,
+    seed: int,
+    counts: int,
+    quality: float,
+    *arguments: str,
+    status: str = "FINISHED",
+    lacking: tuple[str, ...] = (),
+) -> str:
+    """A run as training leaves it, with the same count of 1,000 trajectories in every setting.
+
+    It was logged before there were the metrics that it is `lacking`.
+    """
     store = tracking.client()
     experiment = store.get_experiment_by_name("conflow")
     assert experiment is not None
@@ -22,10 +39,11 @@ def add_run(ablation: str, seed: int, counts: int, quality: float, *arguments: s
     tags = {"ablation": ablation, "preset": "smoke", "seed": str(seed), "config_sha": settings.sha()}
     run_id = store.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
     values: dict[str, float] = {}
-    for group in ("test/none", "test/robot", "test/obstacle", "without_model/data", "without_model/source"):
+    for group in GROUPS:
         values |= {f"{group}/num": 1000}
-        values |= {f"{group}/{name}_count": counts for name in ("robot_collision", "object_collision")}
-        values |= {f"{group}/{metric.rsplit('/', 1)[1]}": quality for metric in list(QUALITIES)[1:]}
+        values |= {f"{group}/{name}_count": counts for name in RATES if name not in lacking}
+        values |= {f"{group}/{name}": quality for name in OTHERS if name not in lacking}
+    values.pop("without_model/feasible/energy_distance", None)
     store.log_batch(run_id, metrics=[Metric(key, value, 0, 0) for key, value in values.items()])
     store.set_terminated(run_id, status)
     return str(run_id)
@@ -120,6 +138,93 @@ def test_a_rate_is_never_shown_without_interval_seeds_and_count(comparison: Comp
 def test_every_column_of_the_papers_first_table_has_its_cell(comparison: Comparison) -> None:
     columns = {c.column for c in comparison.cells if c.table == "1" and c.row == "ConFlow (D+ and D-)"}
     assert columns == set(COLLISIONS.values())
+
+
+def test_table_3_guards_every_ablation_and_what_no_model_touched(comparison: Comparison) -> None:
+    rows: dict[str, list[str]] = {}
+    for each in comparison.cells:
+        if each.table == "3":
+            rows.setdefault(each.row, []).append(each.column)
+    guards = list(GUARDS.values())
+    feasible = rows.pop("no model: feasible test data")
+    assert feasible == [guard for guard in guards if guard != "energy distance to held-out D+"]
+    sources = {"no model: source cgp", "no model: source gaussian"}
+    methods = {"ConFlow (D+ and D-)", "FM (D+)", "FM (D+ and D-)", "ConFlow, Gaussian source"}
+    assert rows.keys() == methods | sources | {"no model: test data"}
+    assert all(columns == guards for columns in rows.values())
+    success = cell(comparison, "3", "ConFlow (D+ and D-)", "success rate")
+    assert (success.count, success.low, success.high) == (86, *wilson(86, 4000))
+    energy = cell(comparison, "3", "ConFlow (D+ and D-)", "energy distance to held-out D+")
+    assert (energy.value, energy.seed_low, energy.seed_high) == pytest.approx((0.0115, 0.010, 0.013))
+    assert (energy.count, energy.low) == (None, None)
+
+
+@pytest.fixture(scope="module")
+def patchy(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    """Runs of three versions: the oldest first in the table, and one seed of the second that is old."""
+    guards = ("energy_distance", "path_length_median", "success", "outside")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        monkeypatch.chdir(tmp_path_factory.mktemp("patchy"))
+        monkeypatch.setitem(compare.METHODS, "removed", "an ablation whose file is gone, with a run")
+        tracking.client().set_tag(add_run("cgp", 7, 10, 0.1), "ablation", "removed")
+        for seed in range(2):
+            add_run("cgp", seed, 20, 0.01, lacking=(*guards, "smoothness_median", "robot_collision"))
+            add_run("fm", seed, 40, 0.1, lacking=guards if seed else ())
+            add_run("gaussian", seed, 30, 0.2)
+        return compare.collect("smoke")
+
+
+def test_a_metric_that_a_run_lacks_leaves_its_cells_out_and_no_others(patchy: Comparison) -> None:
+    columns = {
+        row: [c.column for c in patchy.cells if (c.table, c.row) == ("3", row)] for row in compare.METHODS.values()
+    }
+    assert columns["ConFlow (D+ and D-)"] == ["diversity"]
+    assert columns["FM (D+)"] == ["robot-collision rate", "diversity", "smoothness, median"]
+    assert columns["ConFlow, Gaussian source"] == list(GUARDS.values())
+    # The data are the same for all, so any run that measured them will do.
+    assert cell(patchy, "3", "no model: test data", "success rate").count == 40
+
+
+def test_a_claim_on_a_metric_that_a_run_lacks_says_so(patchy: Comparison) -> None:
+    claims = {claim.text: claim for claim in patchy.claims}
+    found = claims["CGP beats Gaussian: smoothness, median"]
+    assert (found.verdict, found.p) == ("no runs", None)
+    assert found.detail == "not all runs of cgp and gaussian have test/none/smoothness_median"
+    assert claims["CGP beats Gaussian: start error per robot"].p is not None
+
+
+@pytest.mark.parametrize("form", ["table", "markdown", "csv", "json"])
+def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: compare.Format) -> None:
+    text = rendered(patchy, form)
+    if form == "markdown":
+        _, table_3 = text.split("**Table 3")
+        header, _, old, *_ = [line.split("|")[1:-1] for line in table_3.splitlines() if line.startswith("|")]
+        # In the order of the metrics, although the first row has the third alone.
+        assert [name.strip() for name in header[1:]] == list(GUARDS.values())
+        assert [bool(value.strip()) for value in old[1:]] == [name == "diversity" for name in GUARDS.values()]
+    elif form == "csv":
+        assert len(text.split()) > len(patchy.cells)
+    elif form == "json":
+        assert len(json.loads(text)["cells"]) == len(patchy.cells)
+
+
+@pytest.mark.parametrize("form", get_args(compare.Format))
+def test_without_a_single_cell_the_claims_are_left(comparison: Comparison, form: compare.Format) -> None:
+    text = rendered(replace(comparison, cells=[]), form)
+    assert "table,row" in text if form == "csv" else "no finished run of plus" in text
+    assert "Table" not in text
+
+
+def test_plus_is_compared_with_both_of_the_papers_methods(comparison: Comparison) -> None:
+    claims = {claim.text: claim for claim in comparison.claims}
+    found = claims["plus collides less than ConFlow (D+), without guidance"]
+    assert (found.verdict, found.detail) == ("no runs", "no finished run of plus and no_negatives")
+    assert claims["plus collides less than ConFlow, without guidance"].detail == "no finished run of plus"
+
+
+def test_a_readable_name_without_an_ablation_does_no_harm(patchy: Comparison) -> None:
+    assert patchy.runs.keys() == {"cgp", "fm", "gaussian"}
 
 
 def test_without_runs_the_way_to_some_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

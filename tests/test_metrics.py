@@ -1,17 +1,25 @@
 import math
+from collections.abc import Callable
+from statistics import fmean, stdev
 
 import pytest
 import torch
 from scipy import stats
 from torch import Tensor
 
+from conflow.experiment import metrics as metrics_module
 from conflow.experiment.metrics import (
     CollisionRate,
     Diversity,
     EndpointError,
+    EnergyDistance,
+    OutsideRate,
+    PathLength,
     Smoothness,
+    SuccessRate,
     SweptCollisionRate,
     endpoint_error,
+    path_length,
     quantile_interval,
     smoothness,
     trajectory_metrics,
@@ -108,6 +116,137 @@ def test_diversity_of_two_trajectories_is_their_distance_and_of_copies_zero() ->
     assert copies.compute()["diversity"] == pytest.approx(0, abs=1e-6)
 
 
+def test_path_lengths_of_a_straight_line_a_half_circle_and_a_robot_that_stands_still() -> None:
+    assert path_length(parallel(0.4)).item() == pytest.approx(1)
+    T = 40
+    angle = torch.linspace(0, math.pi, T)
+    x = torch.zeros(1, T, 4)
+    x[0, :, 0], x[0, :, 1] = 0.5 * angle.cos(), 0.5 * angle.sin()
+    # Chords of the half circle of radius 1/2, whose arc is pi/2; the other robot stands still.
+    chords = (T - 1) * math.sin(math.pi / 2 / (T - 1))
+    assert path_length(x).item() == pytest.approx(chords / 2, rel=1e-5)
+    assert path_length(x).item() == pytest.approx(math.pi / 4, rel=1e-3)
+    metric = PathLength()
+    metric.update(torch.cat([x, parallel(0.4, T), x]))
+    result = metric.compute()
+    assert result["path_length_median"] == pytest.approx(chords / 2, rel=1e-5)
+    assert (result["path_length_median_low"], result["path_length_median_high"]) == pytest.approx((chords / 2, 1))
+
+
+def test_leaving_the_workspace_counts_from_one_coordinate_of_one_waypoint_on() -> None:
+    x = parallel(0.5).repeat(4, 1, 1)
+    x[0, 2, 3] = -1  # on the edge
+    x[1, 2, 3] = -1.001
+    x[2, 4, 0] = 1.001
+    x[3, 1, 1] = math.nan
+    metric = OutsideRate("outside")
+    metric.update(x)
+    result = metric.compute()
+    assert (result["outside_rate"], result["outside_count"]) == (0.75, 3)
+    assert (result["outside_low"], result["outside_high"]) == wilson(3, 4)
+
+
+def touching(x: Tensor) -> None:
+    x[0, 2, 3] = -0.2
+
+
+def outside(x: Tensor) -> None:
+    x[0, 2, 3] = -1.1
+
+
+def late_start(x: Tensor) -> None:
+    x[0, 0, 0] += 0.021  # 0.0105 in the mean of both robots
+
+
+def missed_goal(x: Tensor) -> None:
+    x[0, -1, 3] -= 0.021
+
+
+def lost(x: Tensor) -> None:
+    x[0, 2, 2] = math.nan
+
+
+def within_tolerance(x: Tensor) -> None:
+    x[0, 0, 0] += 0.019
+
+
+@pytest.mark.parametrize(
+    ("spoil", "count"),
+    [(within_tolerance, 1), (touching, 0), (outside, 0), (late_start, 0), (missed_goal, 0), (lost, 0)],
+)
+def test_success_takes_all_of_it(spoil: Callable[[Tensor], None], count: int) -> None:
+    x_1, x = parallel(0.5), parallel(0.5)
+    spoil(x)
+    metric = SuccessRate("success", ROBOTS)
+    metric.update(x, x_1)
+    assert metric.compute()["success_count"] == count
+
+
+def distances(x: Tensor, y: Tensor) -> list[float]:
+    """|x_i - y_j| of all pairs but those of a trajectory with itself, one by one."""
+    return [(a - b).norm().item() for a in x.double() for b in y.double() if a is not b and not torch.equal(a, b)]
+
+
+def energy(x: Tensor, y: Tensor) -> dict[str, float]:
+    metric = EnergyDistance(y)
+    metric.update(x)
+    return metric.compute()
+
+
+def test_the_energy_distance_is_that_of_all_pairs() -> None:
+    x, y = swap(7, T=5, seed=1), swap(9, T=5, seed=2)
+    oracle = 2 * fmean(distances(x, y)) - fmean(distances(x, x)) - fmean(distances(y, y))
+    assert energy(x, y)["energy_distance"] == pytest.approx(oracle, rel=1e-9)
+
+
+def test_the_energy_distance_is_scipys_but_for_the_pairs_of_one_with_itself() -> None:
+    x, y = torch.randn(30, 1, 1), 2 * torch.randn(40, 1, 1) + 0.5
+    # scipy's mean over all pairs, diagonal included, is (n - 1) / n of ours within x, and its distance is the root.
+    diagonal = fmean(distances(x, x)) / 30 + fmean(distances(y, y)) / 40
+    oracle = stats.energy_distance(x.flatten().numpy(), y.flatten().numpy()) ** 2
+    assert energy(x, y)["energy_distance"] == pytest.approx(oracle - diagonal, rel=1e-6)
+
+
+def test_pairs_are_the_same_where_rows_come_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, y = swap(100, seed=1), swap(90, seed=2)
+    diversity = Diversity()
+    diversity.update(x)
+    whole = energy(x, y) | diversity.compute()
+    monkeypatch.setattr(metrics_module, "PAIR_ROWS", 7)
+    diversity = Diversity()
+    diversity.update(x)
+    assert energy(x, y) | diversity.compute() == pytest.approx(whole, abs=1e-8)
+
+
+def test_the_energy_distance_of_a_collapsed_model_is_seen_to_single_precision() -> None:
+    copies, y = swap(1, seed=1).repeat(100, 1, 1), swap(100, seed=2)
+    oracle = 2 * fmean(distances(copies[:1], y)) - fmean(distances(y, y))
+    assert energy(copies, y)["energy_distance"] == pytest.approx(oracle, abs=1e-6)
+    assert energy(copies, y)["energy_distance_low"] > 0.1
+
+
+@pytest.mark.parametrize(("shift", "covered"), [(0.0, (0.97, 1.0)), (0.5, (0.88, 0.97)), (1.0, (0.92, 0.98))])
+def test_the_interval_of_the_energy_distance_covers_it(shift: float, covered: tuple[float, float]) -> None:
+    """Standard normals in one dimension: |X - Y| is folded normal."""
+    truth = 2 * stats.foldnorm.mean(shift / math.sqrt(2), scale=math.sqrt(2)) - 4 / math.sqrt(math.pi)
+    generator = torch.Generator().manual_seed(0)
+    results = [
+        energy(torch.randn(200, 1, 1, generator=generator) + shift, torch.randn(100, 1, 1, generator=generator))
+        for _ in range(400)
+    ]
+    low, high = covered
+    assert low <= fmean(r["energy_distance_low"] <= truth <= r["energy_distance_high"] for r in results) <= high
+    values = [r["energy_distance"] for r in results]
+    assert fmean(values) == pytest.approx(truth, abs=4 * stdev(values) / math.sqrt(len(values)))
+
+
+def test_the_energy_distance_grows_with_a_shift() -> None:
+    x, y = swap(400, seed=1), swap(300, seed=2)
+    shifted = [energy(x + shift, y)["energy_distance"] for shift in (0.0, 0.05, 0.1, 0.2)]
+    assert shifted == sorted(shifted)
+    assert shifted[0] < 0.05 < shifted[1] * 20
+
+
 def test_intervals_enclose_their_estimates_and_shrink_with_the_root_of_the_count() -> None:
     spreads = []
     for num in (400, 6400):
@@ -126,10 +265,21 @@ def test_intervals_enclose_their_estimates_and_shrink_with_the_root_of_the_count
 
 def test_metrics_do_not_depend_on_how_the_trajectories_were_split_over_batches() -> None:
     x, x_1 = swap(300, seed=1), swap(300, seed=2)
-    whole, parts = trajectory_metrics(ROBOTS, OBSTACLE), trajectory_metrics(ROBOTS, OBSTACLE)
+    reference = swap(200, seed=3)
+    whole, parts = (trajectory_metrics(ROBOTS, OBSTACLE, reference) for _ in range(2))
     whole.update(x=x, x_1=x_1)
     for a, b in zip(x.split([1, 99, 200]), x_1.split([1, 99, 200]), strict=True):
         parts.update(x=a, x_1=b)
     one, other = whole.compute(), parts.compute()
     assert one.keys() == other.keys()
-    assert all(one[key] == pytest.approx(other[key], rel=1e-12) for key in one)
+    assert {"success_rate", "outside_rate", "path_length_median", "energy_distance"} <= one.keys()
+    assert all(one[key] == pytest.approx(other[key], rel=1e-9) for key in one)
+
+
+def test_without_a_reference_there_is_no_energy_distance_and_all_else() -> None:
+    x = swap(50, seed=1)
+    without, with_one = (trajectory_metrics(ROBOTS, OBSTACLE, reference) for reference in (None, x))
+    for each in (without, with_one):
+        each.update(x=x, x_1=x)
+    left_out = with_one.compute().keys() - without.compute().keys()
+    assert left_out == {"energy_distance", "energy_distance_low", "energy_distance_high"}

@@ -68,12 +68,13 @@ def test_a_run_holds_the_documented_metrics(trained: tuple[Run, str]) -> None:
     run, _ = trained
     expected = {"train/loss", "train/grad_norm", "train/steps_per_second", "val/loss"}
     for setting in SETTINGS:
-        for metric in ("robot_collision", "object_collision", "robot_collision_swept"):
+        for metric in ("robot_collision", "object_collision", "robot_collision_swept", "success", "outside"):
             expected |= {f"test/{setting}/{metric}_{part}" for part in ("rate", "low", "high", "count")}
-        for metric in ("smoothness_median", "smoothness_p95", "start_error", "end_error", "diversity"):
+        values = ("smoothness_median", "smoothness_p95", "start_error", "end_error", "diversity", "energy_distance")
+        for metric in (*values, "path_length_median"):
             expected |= {f"test/{setting}/{metric}{part}" for part in ("", "_low", "_high")}
         expected |= {f"test/{setting}/{name}" for name in ("latency_ms", "num", "start_drift", "end_drift")}
-    expected |= {f"without_model/{what}/robot_collision_count" for what in ("data", "source")}
+    expected |= {f"without_model/{what}/robot_collision_count" for what in ("data", "feasible", "source")}
     assert expected <= set(run.data.metrics)
 
 
@@ -105,10 +106,11 @@ def test_the_command_closes_with_the_metrics_and_the_way_to_the_pages(trained: t
 def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Run, str]) -> None:
     run, _ = trained
     model = load_model(artifacts(run) / "model.ckpt")
-    x_1 = DemonstrationData(model.config).test.x[torch.arange(64) % 50]
+    test = DemonstrationData(model.config).test.x
+    x_1, reference = test[torch.arange(64) % 50], test[~model.robots.violation(test)]
     for setting in SETTINGS:
         x = model.sample(model.source.observe(x_1), setting, random_stream("test samples", 3))
-        metrics = trajectory_metrics(model.robots, model.obstacle)
+        metrics = trajectory_metrics(model.robots, model.obstacle, reference)
         metrics.update(x=x, x_1=x_1)
         for key, value in metrics.compute().items():
             # To the bit but for the order of sums: training and test may run on other numbers of threads.

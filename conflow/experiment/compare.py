@@ -1,12 +1,12 @@
-"""The paper's tables and claims, filled from finished runs in MLflow alone."""
+"""The paper's tables and claims and a table of our own, filled from finished runs in MLflow alone."""
 
 import csv
 import io
 import itertools
 import json
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import Literal, cast, get_args
 
 from mlflow.entities import Run
@@ -30,7 +30,17 @@ METHODS = {
     "fm_mixed": "FM (D+ and D-)",
     "gaussian": "ConFlow, Gaussian source",
     "gp": "ConFlow, GP source",
+    "covariant": "covariant correction",
+    "guided_path": "guided path",
+    "repair": "repaired D-",
+    "spectral": "spectral network",
+    "fitted": "fitted source",
+    "end": "correction at the predicted end",
+    "few_steps": "few solver steps",
+    "plus": "plus: the best together",
 }
+SOURCES = ("cgp", "gaussian", "gp", "spectral", "fitted", "plus")
+"""The ablations whose sources differ."""
 COLLISIONS = {
     "test/none/robot_collision": "none: robot",
     "test/robot/robot_collision": "robot: robot",
@@ -44,6 +54,16 @@ QUALITIES = {
     "test/none/smoothness_p95": "smoothness, 95th percentile",
     "test/none/start_error": "start error per robot",
     "test/none/end_error": "end error per robot",
+}
+# Whether a low collision rate was bought with something else.
+GUARDS = {
+    "test/none/robot_collision": "robot-collision rate",
+    "test/none/energy_distance": "energy distance to held-out D+",
+    "test/none/diversity": "diversity",
+    "test/none/smoothness_median": "smoothness, median",
+    "test/none/path_length_median": "path length, median",
+    "test/none/success": "success rate",
+    "test/none/outside": "outside rate",
 }
 # What the paper prints, Table 1 by row and Table 2 by column. Its FM (D+ and D-) cells for no and for robot guidance
 # look exchanged: a model of data of which 30 % collide cannot give 0.055 unguided.
@@ -66,7 +86,7 @@ class Cell:
     Attributes:
         value, low, high: of a rate the pooled one with Wilson's interval; else the mean over seeds, without one.
         seed_low, seed_high: the smallest and the largest of the seeds.
-        count: trajectories in collision over all seeds, of a rate.
+        count: trajectories that the rate counts, over all seeds, of a rate.
         trajectories: over all seeds.
     """
 
@@ -86,7 +106,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the paper, and what the runs say to it."""
+    """A sentence, and what the runs say to it."""
 
     text: str
     verdict: Verdict
@@ -96,7 +116,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both tables, the claims, and which runs they come from."""
+    """The cells of all tables, the claims, and which runs they come from."""
 
     preset: str
     cells: list[Cell]
@@ -139,7 +159,7 @@ def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
     runs = {ablation: by_seed for ablation, by_seed in runs.items() if by_seed}
     if not runs:
         raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
-    cells = [*_table_1(runs), *_table_2(runs)]
+    cells = [cell for cell in (*_table_1(runs), *_table_2(runs), *_table_3(runs)) if cell is not None]
     return Comparison(
         preset, cells, _claims(runs), {name: [_id(run) for run in by_seed] for name, by_seed in runs.items()}
     )
@@ -151,7 +171,7 @@ def render(comparison: Comparison, form: Format, console: Console) -> None:
         console.out(json.dumps(asdict(comparison), indent=1), highlight=False)
     elif form == "csv":
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(asdict(comparison.cells[0])), lineterminator="\n")
+        writer = csv.DictWriter(text, [field.name for field in fields(Cell)], lineterminator="\n")
         writer.writeheader()
         writer.writerows(asdict(cell) for cell in comparison.cells)
         console.out(text.getvalue(), end="", highlight=False)
@@ -164,8 +184,9 @@ def render(comparison: Comparison, form: Format, console: Console) -> None:
 
 
 def _ablations() -> list[str]:
-    """Those of the paper in its order, then the others by name."""
-    return [*METHODS, *(name for name in config.names("ablation") if name not in METHODS)]
+    """Those of `METHODS` that exist in its order, then the others by name."""
+    names = config.names("ablation")
+    return [*(name for name in METHODS if name in names), *(name for name in names if name not in METHODS)]
 
 
 def _by_seed(ablation: str, preset: str, arguments: Sequence[str]) -> list[Run]:
@@ -187,30 +208,16 @@ def _id(run: Run) -> str:
     return str(run.info.run_id)
 
 
-def _table_1(runs: Mapping[str, list[Run]]) -> list[Cell]:
+def _table_1(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
     cells = []
     for ablation, by_seed in runs.items():
         papers = itertools.chain(PAPER_1.get(ablation, ()), itertools.repeat(None))
         for (metric, column), paper in zip(COLLISIONS.items(), papers, strict=False):
             cells.append(_cell("1", METHODS.get(ablation, ablation), column, paper, metric, by_seed))
-    for ablation in ("cgp", "gaussian", "gp"):
-        if ablation in runs:
-            row = f"no model: source {ablation}"
-            cells += [_cell("1", row, name, None, _baseline(key, "source"), runs[ablation]) for key, name in _UNGUIDED]
-    # The same test demonstrations for every seed, so they are counted once.
-    one = next(iter(runs.values()))[:1]
-    cells += [_cell("1", "no model: test data", name, None, _baseline(key, "data"), one) for key, name in _UNGUIDED]
-    return cells
+    return cells + _without_model("1", COLLISIONS, runs)
 
 
-_UNGUIDED = [(key, column) for key, column in COLLISIONS.items() if key.startswith("test/none/")]
-
-
-def _baseline(key: str, of: str) -> str:
-    return key.replace("test/none/", f"without_model/{of}/")
-
-
-def _table_2(runs: Mapping[str, list[Run]]) -> list[Cell]:
+def _table_2(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
     return [
         _cell("2", row, METHODS[ablation], paper, metric, runs[ablation])
         for ablation, papers in PAPER_2.items()
@@ -219,7 +226,40 @@ def _table_2(runs: Mapping[str, list[Run]]) -> list[Cell]:
     ]
 
 
-def _cell(table: str, row: str, column: str, paper: float | None, metric: str, runs: Sequence[Run]) -> Cell:
+def _table_3(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
+    cells = [
+        _cell("3", METHODS.get(ablation, ablation), column, None, metric, by_seed)
+        for ablation, by_seed in runs.items()
+        for metric, column in GUARDS.items()
+    ]
+    return cells + _without_model("3", GUARDS, runs)
+
+
+def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, list[Run]]) -> list[Cell | None]:
+    """Rows of the sources and of the demonstrations, in those of the columns that are without guidance."""
+    every = [run for by_seed in runs.values() for run in by_seed]
+    rows = [(f"source {name}", "source", runs[name]) for name in SOURCES if name in runs]
+    rows += [("test data", "data", every), ("feasible test data", "feasible", every)]
+    cells = []
+    for row, group, of_row in rows:
+        for metric, column in columns.items():
+            if metric.startswith("test/none/"):
+                baseline = metric.replace("test/none/", f"without_model/{group}/")
+                # The same demonstrations for every run, so they are counted once.
+                chosen = of_row if group == "source" else [run for run in every if _measured(baseline, [run])][:1]
+                cells.append(_cell(table, f"no model: {row}", column, None, baseline, chosen))
+    return cells
+
+
+def _measured(metric: str, runs: Sequence[Run]) -> bool:
+    """Whether all runs, some perhaps logged before there was this metric, have it or the count behind it."""
+    return all(metric in run.data.metrics or f"{metric}_count" in run.data.metrics for run in runs)
+
+
+def _cell(table: str, row: str, column: str, paper: float | None, metric: str, runs: Sequence[Run]) -> Cell | None:
+    """The number, or None where a run lacks the metric."""
+    if not runs or not _measured(metric, runs):
+        return None
     trajectories = [int(run.data.metrics[metric.rsplit("/", 1)[0] + "/num"]) for run in runs]
     count, low, high = None, None, None
     if f"{metric}_count" in runs[0].data.metrics:
@@ -237,7 +277,7 @@ def _cell(table: str, row: str, column: str, paper: float | None, metric: str, r
 
 
 def _claims(runs: Mapping[str, list[Run]]) -> list[Claim]:
-    """The paper's claims in words, each as "a is lower than b"."""
+    """The paper's claims and ours of `plus` in words, each as "a is lower than b"."""
     none, *_ = COLLISIONS
     rates = [
         ("ConFlow collides less than FM, without guidance", "cgp", "fm", none),
@@ -248,10 +288,15 @@ def _claims(runs: Mapping[str, list[Run]]) -> list[Claim]:
         ("naive negatives hurt FM, without guidance", "fm", "fm_mixed", none),
         ("CGP beats Gaussian: collision rate", "cgp", "gaussian", none),
     ]
-    claims = [_compare(runs, text, lower, higher, metric, _fisher) for text, lower, higher, metric in rates]
     others = [(metric, row) for metric, row in QUALITIES.items() if metric != none]
-    return claims + [
-        _compare(runs, f"CGP beats Gaussian: {row}", "cgp", "gaussian", metric, _permutation) for metric, row in others
+    ours = [
+        ("plus collides less than ConFlow, without guidance", "plus", "cgp", none),
+        ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
+    ]
+    return [
+        *(_compare(runs, *claim, _fisher) for claim in rates),
+        *(_compare(runs, f"CGP beats Gaussian: {row}", "cgp", "gaussian", key, _permutation) for key, row in others),
+        *(_compare(runs, *claim, _fisher) for claim in ours),
     ]
 
 
@@ -262,6 +307,8 @@ def _compare(runs: Mapping[str, list[Run]], text: str, lower: str, higher: str, 
     if lower not in runs or higher not in runs:
         missing = " and ".join(name for name in (lower, higher) if name not in runs)
         return Claim(text, "no runs", None, f"no finished run of {missing}")
+    if not _measured(metric, [*runs[lower], *runs[higher]]):
+        return Claim(text, "no runs", None, f"not all runs of {lower} and {higher} have {metric}")
     a, b, p = test(metric, runs[lower], runs[higher])
     verdict: Verdict = "not distinguishable" if p >= LEVEL or a == b else "holds" if a < b else "reversed"
     return Claim(text, verdict, p, f"{a:.4f} against {b:.4f}, {len(runs[lower])} and {len(runs[higher])} seeds")
@@ -270,6 +317,8 @@ def _compare(runs: Mapping[str, list[Run]], text: str, lower: str, higher: str, 
 def _fisher(metric: str, lower: Sequence[Run], higher: Sequence[Run]) -> tuple[float, float, float]:
     """Both pooled rates, and the p of Fisher's exact test on the counts."""
     a, b = (_cell("", "", "", None, metric, runs) for runs in (lower, higher))
+    assert a is not None
+    assert b is not None
     assert a.count is not None
     assert b.count is not None
     table = [[a.count, a.trajectories - a.count], [b.count, b.trajectories - b.count]]
@@ -291,17 +340,19 @@ def _permutation(metric: str, lower: Sequence[Run], higher: Sequence[Run]) -> tu
 
 
 def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Title, header and rows of both tables and of the claims, as text."""
-    titles = {
-        "1": f"Table 1: collision rates, preset {comparison.preset} (setting: what is hit)",
-        "2": f"Table 2: sources, without guidance, preset {comparison.preset}",
+    """Title, header and rows of the tables and of the claims, as text."""
+    preset = comparison.preset
+    tables = {
+        "1": (f"Table 1: collision rates, preset {preset} (setting: what is hit)", COLLISIONS),
+        "2": (f"Table 2: sources, without guidance, preset {preset}", QUALITIES),
+        "3": (f"Table 3: quality without guidance, preset {preset}", GUARDS),
     }
     sheets = []
-    for table, title in titles.items():
+    for table, (title, metrics) in tables.items():
         cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == table}
-        columns = list(dict.fromkeys(column for _, column in cells))
+        columns = _ordered((column for _, column in cells), metrics.values())
         rows = []
-        for row in dict.fromkeys(row for row, _ in cells):
+        for row in _ordered((row for row, _ in cells), metrics.values()):
             of_row = [cells.get((row, column)) for column in columns]
             known = next(cell for cell in of_row if cell is not None)
             size = f"{known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
@@ -312,8 +363,14 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         [claim.text, claim.verdict, "" if claim.p is None else f"p = {claim.p:.2g}", claim.detail]
         for claim in comparison.claims
     ]
-    sheets.append(("The paper's claims", ["claim", "verdict", "exact test", "values"], claims))
+    sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
     return sheets
+
+
+def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
+    """Each name once, metrics in their order even where the first of the runs lacks one."""
+    rank = {metric: i for i, metric in enumerate(metrics)}
+    return sorted(dict.fromkeys(names), key=lambda name: rank.get(name, 0))
 
 
 def _text(cell: Cell) -> str:

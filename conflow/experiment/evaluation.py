@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from conflow.experiment.build import random_stream
-from conflow.experiment.metrics import endpoint_error, trajectory_metrics
+from conflow.experiment.metrics import EnergyDistance, endpoint_error, trajectory_metrics
 from conflow.experiment.module import SETTINGS, ConFlow, Setting
 from conflow.experiment.progress import ProgressDisplay
 
@@ -25,7 +25,8 @@ class Evaluation:
         source_samples: x_0 of the source, (num, T, D), the same for every setting.
         samples: the trajectories of each setting, (num, T, D).
         results: the metrics of each setting.
-        baseline: the same metrics of what no model touched: "data", the demonstrations themselves, and "source".
+        baseline: the same metrics of what no model touched: "data", the demonstrations themselves, "feasible", D+ of
+            them alone, and "source".
     """
 
     source_samples: Tensor
@@ -46,15 +47,25 @@ def evaluate(model: ConFlow, demonstrations: Tensor, display: ProgressDisplay) -
     """Sample `sample.num` trajectories under every setting and measure them.
 
     Each gets the start and goal of a demonstration (N, T, D), the first again after the last. All settings start
-    from the same x_0, which depends on the seed alone, so they differ by their guidance only.
+    from the same x_0, which depends on the seed alone, so they differ by their guidance only. D+ of the demonstrations
+    is what the energy distance is taken to.
     """
     task = display.add("sampling", len(SETTINGS))
-    x_1 = cycle(demonstrations, model.config.sample.num).to(model.device)
+    demonstrations = demonstrations.to(model.device)
+    violates = model.robots.violation(demonstrations)
+    feasible = demonstrations[~violates]
+    reference = feasible if len(feasible) > 1 else None  # one has no distance to another
+    x_1 = cycle(demonstrations, model.config.sample.num)
     y = model.source.observe(x_1)
     x_0 = model.source.sample(y, random_stream("test samples", model.config.seed, device=model.device))
     evaluation = Evaluation(x_0.cpu())
-    evaluation.baseline["data"] = measure(model, demonstrations.to(model.device), demonstrations.to(model.device))
-    evaluation.baseline["source"] = measure(model, x_0, x_1)
+    # These two hold the reference itself, so their energy distance to it is not a distance of independent samples.
+    evaluation.baseline["data"] = measure(model, demonstrations, demonstrations, None)
+    if reference is not None:
+        evaluation.baseline["feasible"] = measure(model, feasible, feasible, None)
+        if int(violates.sum()) > 1:
+            evaluation.baseline["data"] |= _mixture_distance(demonstrations[violates], feasible)
+    evaluation.baseline["source"] = measure(model, x_0, x_1, reference)
     for done, setting in enumerate(SETTINGS, start=1):
         x = model.flow(x_0, setting)
         evaluation.samples[setting] = x.cpu()
@@ -63,14 +74,17 @@ def evaluate(model: ConFlow, demonstrations: Tensor, display: ProgressDisplay) -
             for name, waypoint in {"start": 0, "end": -1}.items()
         }
         latency = {"latency_ms": _latency_ms(model, y, setting)}
-        evaluation.results[setting] = measure(model, x, x_1) | drift | latency
+        evaluation.results[setting] = measure(model, x, x_1, reference) | drift | latency
         display.update(task, done, f"setting {setting}")
     return evaluation
 
 
-def measure(model: ConFlow, x: Tensor, x_1: Tensor) -> Metrics:
-    """The metrics of trajectories x whose starts and goals were those of x_1, both (num, T, D)."""
-    metrics = trajectory_metrics(model.robots, model.obstacle).to(model.device)
+def measure(model: ConFlow, x: Tensor, x_1: Tensor, reference: Tensor | None) -> Metrics:
+    """The metrics of trajectories x whose starts and goals were those of x_1, both (num, T, D).
+
+    With the energy distance to a reference (m, T, D) where there is one.
+    """
+    metrics = trajectory_metrics(model.robots, model.obstacle, reference).to(model.device)
     metrics.update(x=x, x_1=x_1)
     return metrics.compute() | {"num": len(x)}
 
@@ -78,6 +92,18 @@ def measure(model: ConFlow, x: Tensor, x_1: Tensor) -> Metrics:
 def cycle(x: Tensor, num: int) -> Tensor:
     """The first `num` rows of x, beginning again where there are fewer."""
     return x[torch.arange(num) % len(x)]
+
+
+def _mixture_distance(negatives: Tensor, feasible: Tensor) -> Metrics:
+    """The energy distance of D+ and D- together to D+ alone, without the distance of D+ to itself.
+
+    With p the share of D-, the laws differ by p (D- - D+). The energy distance is quadratic in the difference, hence
+    p^2 times that of D- to D+, which share no trajectory. The interval takes p as known.
+    """
+    p = len(negatives) / (len(negatives) + len(feasible))
+    metric = EnergyDistance(feasible)
+    metric.update(negatives)
+    return {name: p**2 * value for name, value in metric.compute().items()}
 
 
 def _latency_ms(model: ConFlow, y: Tensor, setting: Setting, repetitions: int = 3) -> float:

@@ -8,8 +8,12 @@ from conflow.experiment.module import Setting
 ROWS = {
     "robot_collision_rate": "robot-collision rate",
     "object_collision_rate": "object-collision rate",
+    "success_rate": "success rate",
+    "outside_rate": "rate of leaving the workspace",
+    "energy_distance": "energy distance to held-out D+",
     "smoothness_median": "smoothness, median",
     "smoothness_p95": "smoothness, 95th percentile",
+    "path_length_median": "path length per robot, median",
     "start_error": "start error per robot",
     "end_error": "end error per robot",
     "diversity": "diversity",
@@ -29,6 +33,9 @@ def results_table(results: dict[Setting, Metrics], title: str) -> Table:
     return table
 
 
-def _estimate(metrics: dict[str, float], key: str) -> str:
+def _estimate(metrics: Metrics, key: str) -> str:
+    """The value over its interval; nothing where the metric was left out."""
+    if key not in metrics:
+        return ""
     stem = key.removesuffix("_rate")
     return f"{metrics[key]:.4f}\n[dim]\\[{metrics[f'{stem}_low']:.4f}, {metrics[f'{stem}_high']:.4f}][/dim]"

@@ -1,0 +1,79 @@
+"""What an evaluation holds, and the comparison of demonstrations with their own feasible part."""
+
+import io
+
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from conflow.experiment import config, report
+from conflow.experiment.evaluation import Evaluation, evaluate
+from conflow.experiment.module import SETTINGS, ConFlow
+from conflow.experiment.progress import ProgressDisplay
+from conflow.scene.trajectories import swap
+
+
+def model() -> ConFlow:
+    torch.manual_seed(0)
+    return ConFlow(config.load(["preset=smoke", "sample.steps=1"]), 32, 4).eval()
+
+
+def evaluated(demonstrations: Tensor) -> Evaluation:
+    with ProgressDisplay(Console(file=io.StringIO())) as display:
+        return evaluate(model(), demonstrations, display)
+
+
+@pytest.fixture(scope="module")
+def evaluation() -> Evaluation:
+    return evaluated(swap(200))
+
+
+def violates(x: Tensor) -> Tensor:
+    return model().robots.violation(x)
+
+
+def test_every_setting_and_baseline_has_the_guards(evaluation: Evaluation) -> None:
+    guards = {"success_rate", "outside_rate", "path_length_median", "energy_distance"}
+    assert all(guards <= evaluation.results[setting].keys() for setting in SETTINGS)
+    assert evaluation.baseline.keys() == {"data", "feasible", "source"}
+    assert all(guards <= evaluation.baseline[name].keys() for name in ("data", "source"))
+
+
+def test_demonstrations_succeed_where_they_do_not_collide(evaluation: Evaluation) -> None:
+    data, feasible = evaluation.baseline["data"], evaluation.baseline["feasible"]
+    assert data["success_count"] == feasible["num"] == int((~violates(swap(200))).sum())
+    assert (feasible["success_rate"], feasible["robot_collision_rate"], feasible["outside_rate"]) == (1, 0, 0)
+
+
+def test_the_feasible_demonstrations_have_no_distance_to_themselves(evaluation: Evaluation) -> None:
+    assert "energy_distance" not in evaluation.baseline["feasible"]
+    assert "without_model/feasible/robot_collision_rate" in evaluation.keyed()
+
+
+def test_the_distance_of_the_demonstrations_to_their_feasible_part_is_that_of_the_mixture(
+    evaluation: Evaluation,
+) -> None:
+    """2 E|X - Y| - E|X - X'| - E|Y - Y'| with X of D- with probability p, else of D+, and Y of D+."""
+    x = swap(200).flatten(1).double()
+    negatives, feasible = x[violates(swap(200))], x[~violates(swap(200))]
+    p = len(negatives) / 200
+    between = float(torch.cdist(negatives, feasible).mean())
+    within_negatives, within_feasible = (float(torch.pdist(part).mean()) for part in (negatives, feasible))
+    cross = p * between + (1 - p) * within_feasible
+    within = p**2 * within_negatives + 2 * p * (1 - p) * between + (1 - p) ** 2 * within_feasible
+    found = evaluation.baseline["data"]
+    assert found["energy_distance"] == pytest.approx(2 * cross - within - within_feasible, rel=1e-6)
+    assert found["energy_distance_low"] < found["energy_distance"] < found["energy_distance_high"]
+
+
+@pytest.mark.parametrize(("feasible", "infeasible", "has"), [(0, 5, set()), (1, 5, set()), (5, 1, {"source"})])
+def test_too_few_demonstrations_leave_the_energy_distance_out(feasible: int, infeasible: int, has: set[str]) -> None:
+    x = swap(200)
+    found = evaluated(torch.cat([x[~violates(x)][:feasible], x[violates(x)][:infeasible]]))
+    assert {name for name, metrics in found.baseline.items() if "energy_distance" in metrics} == has
+    assert ("feasible" in found.baseline) == (feasible > 1)
+    assert ("energy_distance" in found.results["none"]) == (feasible > 1)
+    console = Console(file=io.StringIO(), record=True, width=200)
+    console.print(report.results_table(found.results, "few"))
+    assert "energy distance" in console.export_text()
