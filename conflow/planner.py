@@ -30,7 +30,7 @@ from conflow.experiment.metrics import smoothness, wilson
 from conflow.experiment.module import ConFlow
 from conflow.experiment.tracking import artifact, find_run
 from conflow.flow.correction import Correction
-from conflow.flow.sampler import Field, guided, integrate
+from conflow.flow.sampler import Field, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, Obstacle, Sum
 
@@ -170,9 +170,9 @@ class Planner:
         lambda_o = _weight("obstacle_weight", obstacle_weight, sample.obstacle_weight)
         v: Field = self.model.v
         if guidance in ("robot", "both"):
-            v = guided(v, self.model.u_c, lambda_r)
+            v = self.model.guided(v, self.model.u_c, lambda_r)
         if guidance in ("obstacle", "both") and obstacles:
-            v = guided(v, Correction(Sum(obstacles), self.model.u_c.smoothing), lambda_o)
+            v = self.model.guided(v, Correction(Sum(obstacles), self.model.u_c.smoothing), lambda_o)
         return v
 
     def _avoidance(self, name: str, disc: Obstacle | Sequence[float]) -> Constraint:

@@ -12,6 +12,25 @@ CHANGES = {
     "no_negatives": {"data.negatives"},
     "fm": {"source.kind", "correction.lambda_c", "data.negatives"},
     "fm_mixed": {"source.kind", "correction.lambda_c"},
+    "covariant": {"correction.smoothing", "correction.lambda_c"},
+    "guided_path": {"correction.smoothing", "correction.lambda_c", "correction.path"},
+    "repair": {"data.repair", "correction.margin"},
+    "spectral": {"network.kind", "source.modes"},
+    "fitted": {"source.fit"},
+    "end": {
+        "correction.at",
+        "correction.smoothing",
+        "correction.lambda_c",
+        "correction.margin",
+        "data.negative_share",
+    },
+    "few_steps": {"sample.solver", "sample.steps"},
+}
+CHANGES["plus"] = (CHANGES["end"] | CHANGES["spectral"] | CHANGES["fitted"] | CHANGES["few_steps"]) | {
+    "constraint.gamma",
+    "train.batch_size",
+    "sample.num",
+    "sample.obstacle_weight",
 }
 
 
@@ -103,6 +122,14 @@ def test_a_config_survives_being_written_and_read() -> None:
         ("correction.width=4", "correction.width=4: expected an odd number"),
         ("data.test_fraction=0.95", "data.test_fraction=0.95: expected less than 1 together with data.val_fraction"),
         ("train.lr=[", "train.lr=[: expected a finite number"),
+        ("source.modes=0", "source.modes=0: expected a whole number or null of at least 1"),
+        ("source.modes=1.5", "source.modes=1.5: expected a whole number or null"),
+        (
+            "data.negative_share=2",
+            "data.negative_share=2.0: expected a finite number or null of at least 0 and at most 1",
+        ),
+        ("network.kind=mlp", "network.kind=mlp: expected one of resmlp, spectral"),
+        ("correction.at=and", "correction.at=and: expected one of point, end"),
     ],
 )
 def test_a_bad_argument_is_refused_in_one_line_that_says_what_was_expected(argument: str, said: str) -> None:
@@ -115,3 +142,20 @@ def test_a_bad_argument_is_refused_in_one_line_that_says_what_was_expected(argum
 def test_fitting_the_standard_normal_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"expected source\.kind gp or cgp"):
         config.load(["source.kind=gaussian", "source.fit=true"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["correction.at=end", "correction.path=guided"], "correction.path=guided: expected correction.at=point"),
+        (["data.negative_share=0.1", "data.negatives=false"], "data.negative_share=0.1: expected data.negatives=true"),
+        (["data.repair=true", "data.negatives=false"], "data.repair=True: expected data.negatives=true"),
+        (["data.repair=true"], "correction.margin=0.0: expected a number above 0 where data.repair=true"),
+        (["source.kind=gaussian", "network.kind=spectral"], "source.kind=gaussian: expected gp or cgp"),
+        (["source.kind=gaussian", "correction.smoothing=covariant"], "source.kind=gaussian: expected gp or cgp"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(arguments: list[str], said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        config.load(arguments)
+    assert said in str(refused.value)

@@ -1,17 +1,25 @@
-"""The smoothed correction u^c against SciPy's Gaussian filter."""
+"""The smoothed correction u^c: the Gaussian filter against SciPy's, the covariant one, and repair by it."""
 
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from conflow.flow.correction import Correction, gaussian_filter
-from conflow.scene.constraint import RobotAvoidance
+from conflow.flow import source
+from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
+from conflow.scene.constraint import Barrier, RobotAvoidance
 from conflow.scene.robots import PointRobots
+from conflow.scene.trajectories import swap
 
 
 class Quadratic:
     """C(x) = |x|^2 / 2, whose gradient is x."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return x.amin(dim=2)
+
+    def barrier(self, x: Tensor) -> Tensor:
+        return x.square().sum(dim=(1, 2)) / 2
 
     def gradient(self, x: Tensor) -> Tensor:
         return x
@@ -62,3 +70,91 @@ def test_the_correction_filters_every_dimension_by_itself(constraint: Quadratic 
 def test_a_checkpoint_holds_nothing_of_the_correction() -> None:
     """The correction follows from the config: its state is empty, so another one fits the same checkpoint."""
     assert not Correction(RobotAvoidance(PointRobots(2)), gaussian_filter(32)).state_dict()
+
+
+def robots(margin: float = 0.0, shape: Barrier | None = None) -> RobotAvoidance:
+    return RobotAvoidance(PointRobots(2), 0.3 + margin, shape)
+
+
+def colliding(num: int, T: int = 32) -> Tensor:
+    x = swap(num, T)
+    return x[robots().violation(x)]
+
+
+def test_the_covariant_correction_leaves_what_the_source_is_conditioned_on() -> None:
+    """Rows of Sigma at start and goal are zero, so u^c is zero there to the last bit; the filter's is not."""
+    x = colliding(300)
+    x[:, 1] = x[:, 0]
+    x[:, 1, 2:] = x[:, 1, :2] + 0.1  # a collision beside the start
+    moved, kept = (Correction(robots(), S)(x)[:, [0, -1]] for S in (gaussian_filter(32), covariant(cgp().covariance)))
+    assert not kept.any()
+    assert moved.any()
+
+
+def cgp(T: int = 32, length_scale: float = 0.4) -> source.Source:
+    return source.cgp(T, length_scale)
+
+
+def test_a_covariant_correction_is_a_shift_of_finite_cameron_martin_norm() -> None:
+    """|Sigma g|^2 in the norm of Sigma^-1 is <g, Sigma g>: moderate, where the filtered bump's is astronomical."""
+    Sigma = cgp().covariance[1:-1, 1:-1]
+    g = robots().gradient(colliding(300)).double()[:, 1:-1]
+    norms = []
+    for S in (covariant(Sigma), gaussian_filter(32)[1:-1, 1:-1]):
+        u_c = S @ g
+        norms.append(((u_c * torch.linalg.solve(Sigma, u_c)).sum(dim=(1, 2)) / u_c.square().sum(dim=(1, 2))).median())
+    # Per unit of displacement: a few inverse variances of the leading modes, against that of the white part, 1e6.
+    assert norms[0] < 10
+    assert norms[1] > 1e3
+
+
+@pytest.mark.parametrize(("T", "length_scale"), [(16, 0.4), (64, 0.4), (128, 0.4), (32, 0.2), (32, 0.8), (32, 1.6)])
+def test_lambda_means_the_same_for_every_number_of_waypoints_and_length_scale(T: int, length_scale: float) -> None:
+    """The time in which x' = u^c(x) takes 90 % of D- out of collision, against T = 32 and length scale 0.4."""
+
+    def clearing_time(T: int, length_scale: float) -> float:
+        x, tau = colliding(300, T), 0.0
+        u_c = Correction(robots(), covariant(cgp(T, length_scale).covariance))
+        while robots().violation(x).float().mean() > 0.1:
+            x, tau = x + 0.02 * u_c(x), tau + 0.02
+        return tau
+
+    # Within 15 %; the covariance itself, or scaled to a peak of 1, is off by factors from 2 to 100.
+    assert clearing_time(T, length_scale) == pytest.approx(clearing_time(32, 0.4), rel=0.15)
+
+
+def test_repair_moves_every_collision_out_and_nothing_else() -> None:
+    """The gradient flow of the covariant correction, with start and goal fixed to the last bit."""
+    x = swap(2000)
+    u_c = Correction(robots(0.06, Barrier("relu")), covariant(cgp().covariance))
+    again = repair(x, u_c)
+    assert not robots(0.059).violation(again).any()
+    assert torch.equal(again[:, [0, -1]], x[:, [0, -1]])
+    untouched = ~robots(0.06).violation(x)
+    assert torch.equal(again[untouched], x[untouched])
+    # A displacement of centimetres, not another trajectory.
+    assert (again - x)[~untouched].abs().amax(dim=(1, 2)).median() < 0.25
+
+
+def test_one_step_of_repair_solves_a_linear_constraint() -> None:
+    """C = <n, x> - b where negative: one Newton step lands on C = 0, moved along S n."""
+    n = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
+
+    class Halfspace(Quadratic):
+        def barrier(self, x: Tensor) -> Tensor:
+            return ((n * x).sum(dim=(1, 2)) - 1).clamp(max=0)
+
+        def gradient(self, x: Tensor) -> Tensor:
+            return n.expand_as(x)
+
+    S = gaussian_filter(5, 2.0, 3)
+    x = torch.zeros(1, 5, 2)
+    moved = repair(x, Correction(Halfspace(), S), steps=1)
+    assert (n * moved).sum().item() == pytest.approx(1, abs=1e-6)
+    torch.testing.assert_close(moved[0] / moved.norm(), (S.float() @ n) / (S.float() @ n).norm())
+
+
+def test_what_cannot_be_repaired_stays_as_it_is() -> None:
+    """Two robots on one path have no direction in which to part."""
+    x = torch.linspace(-0.5, 0.5, 32)[None, :, None].expand(1, 32, 4).contiguous()
+    assert torch.equal(repair(x, Correction(robots(0.06, Barrier("relu")), covariant(cgp().covariance))), x)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from conflow.experiment import config
+from conflow.experiment.build import robot_avoidance
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import Batches, DemonstrationData, Split
 from conflow.scene.trajectories import DemonstrationError, swap
@@ -104,3 +105,23 @@ def test_a_trajectory_outside_the_workspace_is_refused_by_number(smoke: Config, 
     x[17, 3, 1] = 1.5
     with pytest.raises(DemonstrationError, match=r"1 trajectories leave the workspace \[-1, 1\], the first is 17"):
         DemonstrationData(on_file(smoke, tmp_path / "far.npz", x=x))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_a_batch_holds_the_share_of_negatives_that_is_asked_for(smoke: Config, share: float) -> None:
+    split = DemonstrationData(smoke).train
+    label = {x.numpy().tobytes(): bool(m) for x, m in zip(*split, strict=True)}
+    for x, violates in Batches(split, 50, 5, seed=0, negative_share=share):
+        assert violates.sum() == round(50 * share)
+        assert [label[row.numpy().tobytes()] for row in x] == violates.tolist()
+
+
+def test_repaired_demonstrations_are_all_feasible_and_feasible_ones_are_not_touched() -> None:
+    mixed = DemonstrationData(config.load(["preset=smoke"]))
+    repaired = DemonstrationData(config.load(["preset=smoke", "ablation=repair", "correction.margin=0.01"]))
+    assert not repaired.train.violates.any()
+    assert not repaired.val.violates.any()
+    far = robot_avoidance(mixed.config, 4, margin=0.01)
+    feasible = ~far.violation(mixed.train.x)
+    assert torch.equal(repaired.train.x[feasible], mixed.train.x[feasible])
+    assert torch.equal(repaired.test.x, mixed.test.x)

@@ -7,7 +7,8 @@ from conflow.experiment import config
 from conflow.experiment.build import fitted, random_stream
 from conflow.experiment.config import Config
 from conflow.experiment.metrics import smoothness
-from conflow.experiment.module import SETTINGS, ConFlow
+from conflow.experiment.module import SETTINGS, ConFlow, Setting
+from conflow.flow.path import guided_path, interpolate
 from conflow.flow.sampler import integrate
 from conflow.flow.source import ENDPOINTS, fit_rbf
 from conflow.scene.trajectories import swap
@@ -127,3 +128,76 @@ def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.autograd, "backward", forbidden)
     for setting in SETTINGS:
         assert not flow.sample(y, setting, noise()).requires_grad
+
+
+def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes() -> None:
+    """u_t = x_1 - x_0 + lambda t S grad C(x_t + (1 - t) v), by autograd, whatever M is, and v held fixed in it."""
+    flow = model("correction.at=end", "correction.smoothing=covariant", "correction.margin=0.05")
+    x_1, draws = swap(300), noise()
+    x_0 = flow.source.sample(x_1[:, [0, -1]], draws)
+    t = torch.rand(300, generator=draws)
+    s = t[:, None, None]
+    x_t = (1 - s) * x_0 + s * x_1
+    v = flow.v(x_t, t)
+    x_end = (x_t + (1 - s) * v).detach().requires_grad_()
+    C = -F.softplus(-10 * ((x_end[..., :2] - x_end[..., 2:]).norm(dim=-1) - 0.35)) / 10
+    (g,) = torch.autograd.grad(C.sum(), x_end)
+    Sigma = flow.source.covariance
+    target = x_1 - x_0 + 2.5 * s * ((Sigma / Sigma.sum(dim=1).max()).float() @ g)
+    expected = ((v - target) ** 2).mean()
+    for M in (torch.zeros(300, dtype=torch.bool), torch.ones(300, dtype=torch.bool)):
+        # Single precision.
+        assert flow.loss(x_1, M, noise()).item() == pytest.approx(expected.item(), rel=1e-5)
+    # Only v in the difference is differentiated, not where the correction was taken.
+    bias = flow.v.outlet.bias
+    (mine,) = torch.autograd.grad(flow.loss(x_1, ~M, noise()), bias)
+    (reference,) = torch.autograd.grad(expected, bias)
+    torch.testing.assert_close(mine, reference, rtol=1e-4, atol=1e-6)
+
+
+def test_a_feasible_prediction_is_not_corrected() -> None:
+    """With the relu barrier the loss on far-away trajectories is plain flow matching's."""
+    x_1 = swap(400, amplitudes=(0.05,))
+    x_1[..., 1] -= 0.5
+    x_1[..., 3] += 0.5
+    arguments = ("correction.at=end", "constraint.barrier=relu", "network.kind=spectral", "source.modes=8")
+    corrected, plain = model(*arguments), model(*arguments, "correction.lambda_c=0")
+    plain.load_state_dict(corrected.state_dict())
+    for flow in (corrected, plain):
+        flow.fit(x_1)  # the Gaussian flow of the demonstrations predicts their mean: feasible
+    M = torch.zeros(400, dtype=torch.bool)
+    assert torch.equal(corrected.loss(x_1, M, noise()), plain.loss(x_1, M, noise()))
+
+
+def test_the_guided_loss_regresses_the_velocity_of_the_guided_path() -> None:
+    flow = model("ablation=guided_path")
+    x_1, draws = swap(100), noise()
+    x_0 = flow.source.sample(x_1[:, [0, -1]], draws)
+    t = torch.rand(100, generator=draws)
+    M = closest(x_1) < 0.3
+    x_t, u_t = guided_path(x_0, x_1, t, flow.u_c, 20.0 * M)
+    assert flow.loss(x_1, M, noise()).item() == pytest.approx(F.mse_loss(flow.v(x_t, t), u_t).item(), rel=1e-6)
+    straight = interpolate(x_0, x_1, t)
+    moved = (x_t - straight).abs().amax(dim=(1, 2)) > 1e-4
+    assert not moved[~M].any()
+    assert moved[M].float().mean() > 0.5
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: Setting) -> None:
+    x_1 = swap(200)
+    flow = model("ablation=plus", "source.fit=false")
+    flow.fit(x_1)
+    torch.nn.init.normal_(flow.v.outlet.weight, std=0.1)
+    y = flow.source.observe(x_1)
+    x = flow.sample(y, setting, noise())
+    assert torch.equal(flow.source.observe(x), y)
+
+
+def test_guidance_of_plus_acts_where_its_training_does() -> None:
+    """v + lambda t u^c(x + (1 - t) v): nothing at t = 0, the plain guidance at t = 1."""
+    flow = model("ablation=plus", "source.fit=false")
+    x, field = swap(50), flow.field("robot")
+    assert torch.equal(field(x, torch.zeros(50)), flow.v(x, torch.zeros(50)))
+    expected = flow.v(x, torch.ones(50)) + flow.config.sample.robot_weight * flow.u_c(x)
+    torch.testing.assert_close(field(x, torch.ones(50)), expected)

@@ -1,10 +1,15 @@
-"""The velocity network v_theta."""
+"""The velocity networks v_theta."""
 
 import pytest
 import torch
 from torch import nn
 
-from conflow.flow.network import ResidualBlock, ResMLP
+from conflow.flow.network import ResidualBlock, ResMLP, SpectralMLP
+from conflow.flow.sampler import integrate
+from conflow.flow.source import ENDPOINTS, Source, rbf
+from conflow.scene.constraint import RobotAvoidance
+from conflow.scene.robots import PointRobots
+from conflow.scene.trajectories import swap
 
 
 def network() -> ResMLP:
@@ -59,3 +64,56 @@ def test_the_papers_network_has_the_papers_size() -> None:
     assert parameters == inlet + 4 * block + outlet
     # A multiply-add is two operations, the backward pass costs twice the forward one.
     assert 6 * 2048 * parameters == pytest.approx(107e9, rel=0.02)
+
+
+def spectral(modes: int = 8) -> tuple[SpectralMLP, Source]:
+    torch.manual_seed(0)
+    source = Source(rbf(32, 0.4, 1.0, 1e-6), ENDPOINTS, modes=modes)
+    v = SpectralMLP(source, 4, RobotAvoidance(PointRobots(2)), hidden=32, blocks=1)
+    nn.init.normal_(v.outlet.weight, std=0.3)
+    return v, source
+
+
+def test_a_spectral_velocity_is_zero_at_start_and_goal_and_within_the_modes() -> None:
+    """v = E (...): endpoints to the last bit, and nothing outside the span of E."""
+    v, source = spectral()
+    x = source.sample(source.observe(swap(100)))
+    velocity = v(x, torch.rand(100, generator=torch.Generator().manual_seed(1)))
+    assert not velocity[:, [0, -1]].any()
+    E = source.modes.float()
+    torch.testing.assert_close(E @ (E.mT @ velocity), velocity, rtol=0, atol=1e-5)  # float32 rounding
+    assert velocity.norm() > 1
+
+
+def test_no_white_part_of_the_source_survives() -> None:
+    """The source of few modes lies in them, and the flow stays there: eighth differences are rounding."""
+    v, source = spectral()
+    y = source.observe(swap(100))
+    x_1 = integrate(v, source.sample(y), steps=3, solver="midpoint")
+    assert torch.equal(source.observe(x_1), y)
+    residual = (x_1 - source.mean(y)).double()
+    outside = residual - source.modes @ (source.modes.mT @ residual)
+    assert outside.abs().max() < 1e-5  # the full source's epsilon is 1e-3
+
+
+def test_an_untrained_spectral_network_is_the_flow_between_two_gaussians() -> None:
+    """Its ODE takes N(0, sigma_0^2) to N(0, sigma_1^2) in each mode: z_1 = sigma_1 / sigma_0 z_0."""
+    v, source = spectral(modes=4)
+    nn.init.zeros_(v.outlet.weight)
+    factor = torch.tensor([[0.5, 0.1, 2.0, 1.0]]).mT * torch.linspace(0.5, 1.5, 4)
+    v.variance = factor**2 * v.source_variance
+    x_0 = source.sample(source.observe(swap(50)), torch.Generator().manual_seed(0))
+    x_1 = integrate(v, x_0, steps=400, solver="rk4")
+    # Of a step of 1/400 the fourth-order error is below float32's rounding, some 1e-6 over 400 steps.
+    torch.testing.assert_close(v.coordinates(x_1), factor * v.coordinates(x_0), rtol=1e-3, atol=1e-4)
+
+
+def test_the_variance_of_the_demonstrations_is_kept_in_a_checkpoint() -> None:
+    v, _ = spectral()
+    v.fit(swap(500))
+    z = v.coordinates(swap(500))
+    torch.testing.assert_close(v.variance, z.square().mean(dim=0), rtol=0, atol=2e-7)  # the floor
+    other, _ = spectral()
+    assert not torch.equal(other.variance, v.variance)
+    other.load_state_dict(v.state_dict())
+    assert torch.equal(other.variance, v.variance)

@@ -306,5 +306,20 @@ def test_straight_demonstrations_give_a_usable_kernel() -> None:
     assert length_scale > 1
     fitted = source.cgp(32, length_scale, sigma_f)
     x_0 = fitted.sample(fitted.observe(x), seeded())
-    # epsilon = 1e-6 is a deviation of 1e-3 from the line; six of these in none of 64,000 draws.
-    assert float((x_0 - x).abs().max()) < 6e-3
+    # Of what is not a straight line the kernel gives about epsilon = 1e-6, a deviation of 1e-3.
+    deviation = float(fitted.covariance.diagonal().max().sqrt())
+    assert deviation < 2e-3
+    assert float((x_0 - x).abs().max()) < 6 * deviation  # in none of 64,000 draws
+
+
+def test_a_source_of_few_modes_has_their_covariance_and_keeps_them_when_conditioned_anew() -> None:
+    """Sigma's best approximation of rank m (Eckart-Young): off by the next eigenvalue in the spectral norm."""
+    K = rbf(32, 0.4, 1.0, 1e-6)
+    full, few = Source(K, ENDPOINTS), Source(K, ENDPOINTS, modes=5)
+    assert few.modes.shape == (32, 5)
+    torch.testing.assert_close(few.modes.mT @ few.modes, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-12)
+    error = torch.linalg.matrix_norm(full.covariance - few.covariance, 2)
+    torch.testing.assert_close(error, full.variance[5], rtol=1e-6, atol=0)
+    assert torch.equal(few.covariance[[0, -1]], torch.zeros(2, 32, dtype=torch.float64))
+    assert few.condition((0, 10, -1)).modes.shape == (32, 5)
+    assert Source(K, ENDPOINTS, modes=99).modes.shape == (32, 30)

@@ -9,7 +9,8 @@ from torch import Tensor
 from conflow.experiment import config
 from conflow.experiment.config import Config
 from conflow.flow import source
-from conflow.flow.correction import Correction, gaussian_filter
+from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
+from conflow.flow.network import ResMLP, SpectralMLP
 from conflow.flow.source import Source
 from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance
 from conflow.scene.robots import PointRobots
@@ -21,9 +22,9 @@ CONDITIONED: dict[config.SourceKind, tuple[int, ...]] = {"gaussian": (), "gp": (
 def build_source(settings: config.Source, T: int) -> Source:
     """The source p_0 on T waypoints."""
     if settings.kind == "gaussian":
-        return source.gaussian(T)
+        return Source(torch.eye(T), modes=settings.modes)
     K = source.rbf(T, settings.length_scale, settings.sigma_f, settings.epsilon)
-    return Source(K, CONDITIONED[settings.kind])
+    return Source(K, CONDITIONED[settings.kind], modes=settings.modes)
 
 
 def fitted(settings: Config, demonstrations: Tensor) -> Config:
@@ -35,21 +36,38 @@ def fitted(settings: Config, demonstrations: Tensor) -> Config:
     return replace(settings, source=replace(settings.source, length_scale=length_scale, sigma_f=sigma_f))
 
 
-def robot_avoidance(settings: Config, D: int) -> Constraint:
-    """The constraint that labels, corrects, guides and judges: robots keep their distance."""
-    return RobotAvoidance(PointRobots(D // 2), settings.constraint.radius, _barrier(settings.constraint))
+def robot_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:
+    """The constraint that labels, corrects, guides and judges: robots keep their distance, and a margin."""
+    return RobotAvoidance(PointRobots(D // 2), settings.constraint.radius + margin, _barrier(settings.constraint))
 
 
-def obstacle_avoidance(settings: Config, D: int) -> Constraint:
+def obstacle_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:
     """The constraint that appears at inference alone: robots, discs of half the touching distance, miss a disc."""
-    return ObstacleAvoidance(
-        PointRobots(D // 2), [settings.sample.obstacle], settings.constraint.radius / 2, _barrier(settings.constraint)
+    reach = settings.constraint.radius / 2 + margin
+    return ObstacleAvoidance(PointRobots(D // 2), [settings.sample.obstacle], reach, _barrier(settings.constraint))
+
+
+def correction(settings: config.Correction, constraint: Constraint, source: Source) -> Correction:
+    """u^c of a constraint, smoothed as the settings say."""
+    if settings.smoothing == "covariant":
+        return Correction(constraint, covariant(source.covariance))
+    return Correction(constraint, gaussian_filter(len(source.prior), settings.sigma, settings.width))
+
+
+def network(settings: config.Network, source: Source, D: int, constraint: Constraint) -> ResMLP | SpectralMLP:
+    """The velocity network v_theta."""
+    if settings.kind == "spectral":
+        return SpectralMLP(source, D, constraint, settings.hidden, settings.blocks)
+    return ResMLP(len(source.prior), D, settings.hidden, settings.blocks)
+
+
+def repaired(settings: Config, x: Tensor) -> Tensor:
+    """Demonstrations x (N, T, D), those in collision moved out of it by the margin, along the source's covariance."""
+    D = x.shape[2]
+    constraint = RobotAvoidance(
+        PointRobots(D // 2), settings.constraint.radius + settings.correction.margin, Barrier("relu")
     )
-
-
-def correction(settings: config.Correction, constraint: Constraint, T: int) -> Correction:
-    """u^c of a constraint, smoothed by the Gaussian filter."""
-    return Correction(constraint, gaussian_filter(T, settings.sigma, settings.width))
+    return repair(x, Correction(constraint, covariant(build_source(settings.source, x.shape[1]).covariance)))
 
 
 def random_stream(*key: str | int, device: torch.device | str = "cpu") -> torch.Generator:

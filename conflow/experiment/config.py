@@ -23,6 +23,10 @@ CONF = Path(__file__).parents[2] / "conf"
 
 SourceKind = Literal["gaussian", "gp", "cgp"]
 Schedule = Literal["constant", "one_cycle"]
+NetworkKind = Literal["resmlp", "spectral"]
+Smoothing = Literal["filter", "covariant"]
+Place = Literal["point", "end"]
+PathKind = Literal["linear", "guided"]
 Tree = dict[str, Any]
 
 
@@ -62,6 +66,8 @@ class Data:
     jitter: Annotated[float, Range(0, 0.2)]
     seed: Seed
     negatives: bool
+    negative_share: Annotated[float | None, Range(0, 1)]
+    repair: bool
     val_fraction: Fraction
     test_fraction: Fraction
 
@@ -72,6 +78,7 @@ class Source:
     length_scale: Positive
     sigma_f: Positive
     epsilon: Positive
+    modes: Annotated[int | None, Range(1, 4096)]
     fit: bool
 
 
@@ -86,12 +93,17 @@ class Constraint:
 @dataclass(frozen=True)
 class Correction:
     lambda_c: Weight
+    at: Place
+    path: PathKind
+    margin: Annotated[float, Range(0, 1)]
+    smoothing: Smoothing
     sigma: Positive
     width: Count
 
 
 @dataclass(frozen=True)
 class Network:
+    kind: NetworkKind
     hidden: Annotated[int, Range(1, 65536)]
     blocks: Annotated[int, Range(0, 1024)]
 
@@ -311,6 +323,8 @@ def _describe(kind: Any) -> str:
         bool: "true or false",
         str: "a name",
         list[float]: "[a, b, ...]",
+        int | None: "a whole number or null",
+        float | None: "a finite number or null",
     }
     return words.get(kind, "a text or null")
 
@@ -330,5 +344,20 @@ def _check(config: Config) -> None:
             f"data.test_fraction={config.data.test_fraction}: expected less than 1 together with "
             f"data.val_fraction={config.data.val_fraction}"
         )
+    if config.correction.at == "end" and config.correction.path == "guided":
+        raise ConfigError("correction.path=guided: expected correction.at=point, the path is guided at its own points")
+    if config.data.negative_share is not None and (not config.data.negatives or config.data.repair):
+        raise ConfigError(
+            f"data.negative_share={config.data.negative_share}: expected data.negatives=true and data.repair=false"
+        )
+    if config.data.repair and not config.data.negatives:
+        raise ConfigError("data.repair=True: expected data.negatives=true, there is nothing to repair in D+")
+    if config.data.repair and not config.correction.margin:
+        # Repair comes as near to the boundary as it wants, from within: without a margin the label would not change.
+        raise ConfigError("correction.margin=0.0: expected a number above 0 where data.repair=true")
+    if config.source.kind == "gaussian" and (
+        config.correction.smoothing == "covariant" or config.network.kind == "spectral"
+    ):
+        raise ConfigError("source.kind=gaussian: expected gp or cgp where the source's covariance is asked for")
     if config.source.fit and config.source.kind == "gaussian":
         raise ConfigError("source.fit=True: expected source.kind gp or cgp, the standard normal has nothing to fit")

@@ -8,7 +8,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
-from conflow.experiment.build import random_stream, robot_avoidance
+from conflow.experiment.build import random_stream, repaired, robot_avoidance
 from conflow.experiment.config import Config
 from conflow.scene import trajectories
 from conflow.scene.trajectories import DemonstrationError
@@ -29,10 +29,20 @@ class Batches:
     """x_1 ~ q(x_1): `steps` whole batches drawn by index from memory, each a function of (seed, step) alone.
 
     Iteration starts after `step` batches, which `state_dict` remembers.
+
+    Args:
+        negative_share: of D- in each batch; None draws from all alike.
     """
 
-    def __init__(self, split: Split, batch_size: int, steps: int, seed: int) -> None:
-        self.split, self.batch_size, self.steps, self.seed = split, batch_size, steps, seed
+    def __init__(
+        self, split: Split, batch_size: int, steps: int, seed: int, negative_share: float | None = None
+    ) -> None:
+        self.split, self.steps, self.seed = split, steps, seed
+        parts = [(torch.ones_like(split.violates), batch_size)]
+        if negative_share is not None:
+            negatives = round(negative_share * batch_size)
+            parts = [(split.violates, negatives), (~split.violates, batch_size - negatives)]
+        self.parts = [(chosen.nonzero()[:, 0], count) for chosen, count in parts if count]
         self.step = 0
 
     def __len__(self) -> int:
@@ -41,8 +51,11 @@ class Batches:
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         x, violates = self.split
         for step in range(self.step, self.steps):
-            i = torch.randint(len(x), (self.batch_size,), generator=random_stream("batch", self.seed, step))
-            i = i.to(x.device)
+            noise = random_stream("batch", self.seed, step)
+            drawn = [
+                part[torch.randint(len(part), (count,), generator=noise).to(x.device)] for part, count in self.parts
+            ]
+            i = torch.cat(drawn)
             self.step = step + 1
             yield x[i], violates[i]
 
@@ -100,17 +113,23 @@ class DemonstrationData(LightningDataModule):
                 )
         else:
             train_split, val_split = train_split.feasible(), val_split.feasible()
+        if data.repair:
+            train_split, val_split = self._repaired(train_split), self._repaired(val_split)
         for part, split in {"training": train_split, "validation": val_split, "test": test_split}.items():
             if not len(split.x):
                 raise DemonstrationError(f"{name}: no trajectory is left for {part} out of {len(self.x)}")
         return train_split, val_split, test_split
+
+    def _repaired(self, split: Split) -> Split:
+        x = repaired(self.config, split.x)
+        return Split(x, robot_avoidance(self.config, self.D).violation(x))
 
     def train_dataloader(self) -> Batches:
         train = self.config.train
         # The data move to the accelerator once, not batch by batch.
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         split = Split(self.train.x.to(device), self.train.violates.to(device))
-        return Batches(split, train.batch_size, train.max_steps, self.config.seed)
+        return Batches(split, train.batch_size, train.max_steps, self.config.seed, self.config.data.negative_share)
 
     def val_dataloader(self) -> DataLoader[tuple[Tensor, ...]]:
         """The whole of `val` as one batch."""

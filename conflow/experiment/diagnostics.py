@@ -8,7 +8,7 @@ from torch import Tensor
 
 from conflow.experiment.metrics import endpoint_error, smoothness
 from conflow.experiment.module import ConFlow, Setting
-from conflow.flow.sampler import Solver, guided, integrate, states
+from conflow.flow.sampler import Solver, integrate, states
 from conflow.scene.constraint import Constraint
 
 EVALUATIONS: dict[Solver, int] = {"euler": 1, "midpoint": 2, "rk4": 4}
@@ -82,7 +82,7 @@ def collisions_by_weight(model: ConFlow, setting: Setting, x_0: Tensor, weights:
     """How many of the trajectories from x_0 (batch, T, D) hit what the setting avoids, at each guidance weight."""
     sample = model.config.sample
     u_c = model.u_c_obstacle if setting == "obstacle" else model.u_c
-    fields = [guided(model.v, u_c, weight) for weight in weights]
+    fields = [model.guided(model.v, u_c, weight) for weight in weights]
     return [
         int(avoided(model, setting).violation(integrate(field, x_0, sample.steps, sample.solver)).sum())
         for field in fields

@@ -10,11 +10,19 @@ from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
-from conflow.experiment.build import build_source, correction, obstacle_avoidance, random_stream, robot_avoidance
+from conflow.experiment.build import (
+    build_source,
+    correction,
+    network,
+    obstacle_avoidance,
+    random_stream,
+    robot_avoidance,
+)
 from conflow.experiment.config import Config
-from conflow.flow.network import ResMLP
-from conflow.flow.path import interpolate, velocity
-from conflow.flow.sampler import Field, guided, integrate
+from conflow.flow.correction import Correction
+from conflow.flow.network import SpectralMLP
+from conflow.flow.path import end, guided_path, interpolate, velocity
+from conflow.flow.sampler import Field, guided, guided_ahead, integrate
 
 Setting = Literal["none", "robot", "obstacle"]
 SETTINGS: tuple[Setting, ...] = get_args(Setting)
@@ -33,10 +41,11 @@ class ConFlow(LightningModule):
         super().__init__()
         self.config, self.T, self.D = config, T, D
         self.source = build_source(config.source, T)
-        self.v = ResMLP(T, D, config.network.hidden, config.network.blocks)
         self.robots, self.obstacle = robot_avoidance(config, D), obstacle_avoidance(config, D)
-        self.u_c = correction(config.correction, self.robots, T)
-        self.u_c_obstacle = correction(config.correction, self.obstacle, T)
+        self.v = network(config.network, self.source, D, self.robots)
+        margin = config.correction.margin
+        self.u_c = correction(config.correction, robot_avoidance(config, D, margin), self.source)
+        self.u_c_obstacle = correction(config.correction, obstacle_avoidance(config, D, margin), self.source)
         self.grad_norm = torch.zeros(())
 
     def training_step(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
@@ -47,24 +56,40 @@ class ConFlow(LightningModule):
         noise = random_stream("validation", self.config.seed, device=self.device)
         self.log("val/loss", self.loss(*batch, noise), batch_size=len(batch[0]), logger=False)
 
+    def fit(self, x_1: Tensor) -> None:
+        """What is known of the demonstrations x_1 (N, T, D) before training."""
+        if isinstance(self.v, SpectralMLP):
+            self.v.fit(x_1)
+
     def loss(self, x_1: Tensor, M: Tensor, noise: torch.Generator) -> Tensor:
         """L_CG (Eq. cg_loss) for demonstrations x_1 (batch, T, D) and their violations M (batch,): Algorithm 1."""
         lambda_c = self.config.correction.lambda_c
         x_0 = self.source.sample(self.source.observe(x_1), noise)
         t = torch.rand(len(x_1), device=x_1.device, generator=noise)
+        if self.config.correction.path == "guided":
+            x_t, u_t = guided_path(x_0, x_1, t, self.u_c, lambda_c * M)
+            return F.mse_loss(self.v(x_t, t), u_t)
         x_t = interpolate(x_0, x_1, t)
-        u_c = self.u_c(x_t)
-        u_t = velocity(x_0, x_1) + lambda_c * M[:, None, None] * u_c
-        return F.mse_loss(self.v(x_t, t), u_t)
+        v = self.v(x_t, t)
+        if self.config.correction.at == "end":
+            # The barrier is its own mask: nothing to correct where the predicted end is feasible.
+            u_c = t[:, None, None] * self.u_c(end(x_t, v.detach(), t))
+        else:
+            u_c = M[:, None, None] * self.u_c(x_t)
+        return F.mse_loss(v, velocity(x_0, x_1) + lambda_c * u_c)
 
     def field(self, setting: Setting) -> Field:
         """The velocity field that a setting samples from."""
         sample = self.config.sample
         if setting == "robot":
-            return guided(self.v, self.u_c, sample.robot_weight)
+            return self.guided(self.v, self.u_c, sample.robot_weight)
         if setting == "obstacle":
-            return guided(self.v, self.u_c_obstacle, sample.obstacle_weight)
+            return self.guided(self.v, self.u_c_obstacle, sample.obstacle_weight)
         return self.v
+
+    def guided(self, v: Field, u_c: Correction, weight: float) -> Field:
+        """A field guided by a correction, taken where the training takes it."""
+        return (guided_ahead if self.config.correction.at == "end" else guided)(v, u_c, weight)
 
     def sample(self, y: Tensor, setting: Setting = "none", noise: torch.Generator | None = None) -> Tensor:
         """Trajectories (batch, T, D), one for each observation y (batch, O, D) of the source (`source.observe`)."""

@@ -31,6 +31,7 @@ def train(config: Config, console: Console) -> str:
     lightning.seed_everything(config.seed, verbose=False)
     data = DemonstrationData(config)
     model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
+    model.fit(data.train.feasible().x)
     with tracking.start(config, data) as logger:
         run_id = str(logger.run_id)
         if config.source.fit:

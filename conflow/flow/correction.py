@@ -7,7 +7,15 @@ from torch import Tensor, nn
 
 
 class Differentiable(Protocol):
-    """What this wing needs of a constraint: the gradient of its barrier C."""
+    """What this wing needs of a constraint."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        """c at every waypoint, (batch, T), of x (batch, T, D)."""
+        ...
+
+    def barrier(self, x: Tensor) -> Tensor:
+        """C, (batch,): 0 where feasible."""
+        ...
 
     def gradient(self, x: Tensor) -> Tensor:
         """grad C at x, both (batch, T, D)."""
@@ -47,3 +55,29 @@ def gaussian_filter(T: int, sigma: float = 5.0, width: int = 9) -> Tensor:
     taps = torch.arange(-reach, reach + 1, dtype=torch.float64)
     w = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= reach)
     return w / torch.exp(-(taps**2) / (2 * sigma**2)).sum()
+
+
+def covariant(Sigma: Tensor) -> Tensor:
+    """The source's covariance as the smoothing matrix, float64 (T, T): S = Sigma / max_i sum_j |Sigma_ij|.
+
+    Sigma grad C is a shift along which the source's law stays absolutely continuous (Cameron-Martin), so a corrected
+    x_t is still one that the source could have led to. It vanishes where the source is conditioned. The scale is the
+    Gaussian filter's: the same push at every waypoint moves none of them by more than that push. It makes lambda
+    mean the same for every number of waypoints and every length scale.
+    """
+    return Sigma.double() / Sigma.double().abs().sum(dim=1).max()
+
+
+def repair(x: Tensor, u_c: Correction, steps: int = 100) -> Tensor:
+    """Trajectories x (batch, T, D) moved out of collision by the gradient flow of the correction S grad C.
+
+    Newton's steps on C(x) = 0 in the metric of S, x <- x - C / <grad C, S grad C> S grad C: each is the least
+    displacement, as measured by S^-1, that solves the linearised equation. For a barrier that is 0 where feasible.
+    What does not move, such as two bodies that share their whole path, stays as it is.
+    """
+    for _ in range(steps):
+        C, g = u_c.constraint.barrier(x), u_c.constraint.gradient(x)
+        moving = (u_c.smoothing @ g) * (C < 0)[:, None, None]
+        slope = (g * moving).sum(dim=(1, 2))
+        x = x + torch.where(slope > 0, -C / slope.clamp_min(torch.finfo(x.dtype).tiny), 0)[:, None, None] * moving
+    return x

@@ -1,7 +1,10 @@
-"""The velocity network v_theta (paper, appendix: "Architecture and training details")."""
+"""The velocity networks v_theta: the paper's (appendix: "Architecture and training details"), and a spectral one."""
 
 import torch
 from torch import Tensor, nn
+
+from conflow.flow.correction import Differentiable
+from conflow.flow.source import Source
 
 
 class ResidualBlock(nn.Module):
@@ -34,3 +37,82 @@ class ResMLP(nn.Module):
         """The velocity at x (batch, T, D) and t (batch,), (batch, T, D)."""
         h = self.inlet(torch.cat([x.flatten(1), t[:, None]], dim=1))
         return self.outlet(self.blocks(h)).view_as(x)
+
+
+class SpectralMLP(nn.Module):
+    """v_theta in the eigenvectors E of the source's Sigma: v(x, t) = E (a(t) z + c(t) h_theta), z = E^T (x - W x_O).
+
+    Each mode has a variance sigma_0^2 under the source, its eigenvalue, and sigma_1^2 among the demonstrations. Were
+    both laws Gaussian, the flow between them would have the velocity a z with
+    a = (t sigma_1^2 - (1 - t) sigma_0^2) / sigma_t^2 and sigma_t^2 = t^2 sigma_1^2 + (1 - t)^2 sigma_0^2. This part is
+    in closed form; the network h_theta learns the rest, of size c = sigma_0 sigma_1 / sigma_t. So the output is as
+    smooth as the modes are, and stays where the source is conditioned to the last bit.
+
+    h_theta sees z / sigma_t, the conditioned values x_O, Fourier features of t, clearances, and grad C in the modes.
+
+    Args:
+        source: its modes, usually a few leading ones.
+        D: dimensions of a trajectory.
+        constraint: gives clearance and grad C.
+        hidden: width.
+        blocks: residual blocks.
+        frequencies: of the features sin(k pi t), cos(k pi t).
+    """
+
+    observed: Tensor
+    mean_map: Tensor
+    modes: Tensor
+    source_variance: Tensor
+    variance: Tensor
+    frequencies: Tensor
+
+    def __init__(
+        self,
+        source: Source,
+        D: int,
+        constraint: Differentiable,
+        hidden: int = 256,
+        blocks: int = 4,
+        frequencies: int = 8,
+    ) -> None:
+        super().__init__()
+        self.constraint = constraint
+        (T, m), observations = source.modes.shape, len(source.index)
+        dtype = torch.get_default_dtype()
+        self.register_buffer("observed", source.index, persistent=False)
+        self.register_buffer("mean_map", source.mean_map.to(dtype), persistent=False)
+        self.register_buffer("modes", source.modes.to(dtype), persistent=False)
+        self.register_buffer("source_variance", source.variance.to(dtype)[:, None].expand(m, D), persistent=False)
+        # Of the demonstrations, so a checkpoint has to hold it.
+        self.register_buffer("variance", self.source_variance.clone())
+        self.register_buffer("frequencies", torch.pi * torch.arange(1, frequencies + 1), persistent=False)
+        self.inlet = nn.Linear(2 * m * D + observations * D + 1 + 2 * frequencies + T, hidden)
+        self.blocks = nn.Sequential(*(ResidualBlock(hidden) for _ in range(blocks)))
+        self.outlet = nn.Linear(hidden, m * D)
+        nn.init.zeros_(self.outlet.weight)  # training starts from the Gaussian flow
+        nn.init.zeros_(self.outlet.bias)
+
+    def fit(self, x_1: Tensor) -> None:
+        """Set sigma_1^2 to the second moments of demonstrations x_1 (N, T, D)."""
+        self.variance = self.coordinates(x_1).square().mean(dim=0).clamp_min(torch.finfo(x_1.dtype).eps)
+
+    def coordinates(self, x: Tensor) -> Tensor:
+        """z = E^T (x - W x_O), (batch, m, D)."""
+        return self.modes.mT @ (x - self.mean_map @ x[:, self.observed])
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        """The velocity at x (batch, T, D) and t (batch,), (batch, T, D)."""
+        z, s = self.coordinates(x), t[:, None, None]
+        sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
+        a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2
+        c = (self.source_variance * self.variance).sqrt() / sigma_t
+        h = self.outlet(self.blocks(self.inlet(self._features(x, z / sigma_t, t))))
+        return self.modes @ (a * z + c * h.view_as(z))
+
+    def _features(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
+        angles = t[:, None] * self.frequencies
+        # Modes as wide as the source is in them; of the clearances only the near ones matter.
+        pushed = (self.source_variance / self.source_variance[0]).sqrt() * (self.modes.mT @ self.constraint.gradient(x))
+        near = 4 * self.constraint.clearance(x).clamp(max=1)
+        values = [z.flatten(1), x[:, self.observed].flatten(1), t[:, None], angles.sin(), angles.cos()]
+        return torch.cat([*values, near, pushed.flatten(1)], dim=1)

@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from conflow.flow.path import end
+
 Field = Callable[[Tensor, Tensor], Tensor]
 """A velocity field: x (batch, T, D) and t (batch,) to dx/dt (batch, T, D)."""
 
@@ -18,6 +20,20 @@ def guided(v: Field, correction: Callable[[Tensor], Tensor], weight: float) -> F
 
     def field(x: Tensor, t: Tensor) -> Tensor:
         return v(x, t) + weight * correction(x)
+
+    return field
+
+
+def guided_ahead(v: Field, correction: Callable[[Tensor], Tensor], weight: float) -> Field:
+    """v(x, t) + lambda t u^c(x + (1 - t) v(x, t)): guided where the flow is going to end instead of where it is.
+
+    What is in collision halfway may be none at t = 1, and needs no guidance. The factor t: the end that is predicted
+    at t = 0 is the mean of all that x_0 may become, which lies between the ways around an obstacle.
+    """
+
+    def field(x: Tensor, t: Tensor) -> Tensor:
+        u = v(x, t)
+        return u + weight * t[:, None, None] * correction(end(x, u, t))
 
     return field
 

@@ -25,6 +25,13 @@ class Source(nn.Module):
         K: prior covariance of the waypoints, (T, T); factored once, in float64.
         index: the conditioned waypoints O, negative ones counted from the end.
         noise: variance of each observation, R = diag(noise); zero where omitted.
+        modes: keep this many leading eigenvectors of Sigma, or as many as there are; None keeps all. A smooth
+            kernel has all its variance in a few, and the others hold its white part epsilon alone.
+
+    Attributes:
+        covariance: Sigma, (T, T).
+        modes: E, eigenvectors of Sigma as columns, the leading one first, (T, m).
+        variance: their eigenvalues, (m,).
 
     Raises:
         ValueError: K is not symmetric positive semi-definite, an index is out of range or given twice, or a
@@ -35,10 +42,15 @@ class Source(nn.Module):
     index: Tensor
     mean_map: Tensor
     covariance: Tensor
+    modes: Tensor
+    variance: Tensor
     sampling_map: Tensor
 
-    def __init__(self, K: Tensor, index: Sequence[int] = (), noise: Sequence[float] = ()) -> None:
+    def __init__(
+        self, K: Tensor, index: Sequence[int] = (), noise: Sequence[float] = (), modes: int | None = None
+    ) -> None:
         super().__init__()
+        self.kept = modes
         K = K.double()
         _check_covariance(K)
         observed, R = _observations(len(K), index, noise)
@@ -54,12 +66,14 @@ class Source(nn.Module):
         Sigma[exact] = 0
         Sigma[:, exact] = 0
         Sigma = (Sigma + Sigma.mT) / 2
-        L = _factor(Sigma, exact)
+        E, variance = _eigenvectors(Sigma, exact, modes)
         self.register_buffer("prior", K.clone())
         self.register_buffer("index", observed)
         self.register_buffer("mean_map", W)
-        self.register_buffer("covariance", Sigma)
-        self.register_buffer("sampling_map", torch.cat([W, L], dim=1).to(torch.get_default_dtype()))
+        self.register_buffer("covariance", Sigma if modes is None else E * variance @ E.mT)
+        self.register_buffer("modes", E)
+        self.register_buffer("variance", variance)
+        self.register_buffer("sampling_map", torch.cat([W, E * variance.sqrt()], dim=1).to(torch.get_default_dtype()))
 
     def observe(self, x: Tensor) -> Tensor:
         """The values y of trajectories x (batch, T, D) at the conditioned waypoints, (batch, O, D)."""
@@ -75,7 +89,7 @@ class Source(nn.Module):
         Raises:
             ValueError: as the class.
         """
-        return Source(self.prior, index, noise)
+        return Source(self.prior, index, noise, self.kept)
 
     def sample(self, y: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """x_0 ~ p_0(. | y), one trajectory (T, D) for each row of y (batch, O, D): W y + L z, as one product."""
@@ -167,12 +181,12 @@ def _observations(T: int, index: Sequence[int], noise: Sequence[float]) -> tuple
     return observed, R
 
 
-def _factor(Sigma: Tensor, exact: Tensor) -> Tensor:
-    """L with L L^T = Sigma, and rows of zeros where an observation is exact, (T, T - len(exact))."""
+def _eigenvectors(Sigma: Tensor, exact: Tensor, modes: int | None) -> tuple[Tensor, Tensor]:
+    """Eigenvectors of Sigma (T, m), with rows of zeros where an observation is exact, and eigenvalues (m,)."""
     free = torch.ones(len(Sigma), dtype=torch.bool)
     free[exact] = False
     # Eigenvectors rather than Cholesky: long length scales leave Sigma singular to rounding.
     variance, U = torch.linalg.eigh(Sigma[free][:, free])
-    L = torch.zeros(len(Sigma), len(variance), dtype=Sigma.dtype)
-    L[free] = U * variance.clamp_min(0).sqrt()
-    return L
+    E = torch.zeros(len(Sigma), len(variance), dtype=Sigma.dtype)
+    E[free] = U
+    return E.flip(1)[:, :modes].contiguous(), variance.flip(0)[:modes].clamp_min(0)
