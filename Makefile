@@ -21,7 +21,7 @@ CONFLOW = $(PYTHON) -m conflow
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
-.PHONY: help train ablations evaluate compare sample figures demonstrations ui test lint lock
+.PHONY: help train ablations evaluate compare sample figures explain demonstrations ui test lint lock
 
 help:  ## List what can be made
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -46,6 +46,9 @@ sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: 
 
 figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,...
 	@$(CONFLOW) figures run=$(RUN)
+
+explain: .venv/installed  ## Draw why the covariant correction works, and finished runs beside it: PRESET=
+	@$(CONFLOW) explain preset=$(PRESET)
 
 demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations $(WRITTEN) seed=$(SEED)

@@ -95,6 +95,21 @@ def figures(arguments: list[str]) -> None:
     gallery.draw(options["run"].split(","), _console())
 
 
+def explain(arguments: list[str]) -> None:
+    """Draw why the covariant correction works, and how the finished runs of a preset compare: preset=quick."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
+    settings = config.load([f"preset={options['preset']}"])
+
+    from conflow.experiment.figures import explain, gallery
+
+    console = _console()
+    explain.draw(settings, console)
+    gallery.draw_front(settings, console)
+
+
 def demonstrations(arguments: list[str]) -> None:
     """Write demonstrations that bulge where the robots pass, for data.path: out=passing.npz num=3000 seed=0."""
     from conflow.experiment import config, signals
@@ -128,6 +143,7 @@ COMMANDS = {
     "compare": compare,
     "sample": sample,
     "figures": figures,
+    "explain": explain,
     "demonstrations": demonstrations,
     "ui": ui,
 }

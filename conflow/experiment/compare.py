@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy import stats
 
 from conflow.experiment import config, tracking
-from conflow.experiment.config import Config, ConfigError
+from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
 
 Format = Literal["table", "markdown", "csv", "json"]
@@ -124,14 +124,12 @@ class Comparison:
     runs: dict[str, list[str]]
 
 
-def finished_runs(settings: Config, data_digest: str | None = None) -> list[Run]:
-    """FINISHED runs of exactly this config (and on exactly this data), the newest first."""
+def finished_runs(**tags: str) -> list[Run]:
+    """FINISHED runs with these tags, the newest first."""
     store = tracking.client()
     experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
     assert experiment is not None
-    conditions = ["attributes.status = 'FINISHED'", f"tags.config_sha = '{settings.sha()}'"]
-    if data_digest is not None:
-        conditions.append(f"tags.data_digest = '{data_digest}'")
+    conditions = ["attributes.status = 'FINISHED'", *(f"tags.{name} = '{value}'" for name, value in tags.items())]
     return list(
         store.search_runs([experiment.experiment_id], " AND ".join(conditions), order_by=["attributes.start_time DESC"])
     )
@@ -191,12 +189,8 @@ def _ablations() -> list[str]:
 
 def _by_seed(ablation: str, preset: str, arguments: Sequence[str]) -> list[Run]:
     """The newest run of each seed, by seed."""
-    store = tracking.client()
-    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
-    assert experiment is not None
-    condition = f"attributes.status = 'FINISHED' AND tags.ablation = '{ablation}' AND tags.preset = '{preset}'"
     newest: dict[int, Run] = {}
-    for run in store.search_runs([experiment.experiment_id], condition, order_by=["attributes.start_time DESC"]):
+    for run in finished_runs(ablation=ablation, preset=preset):
         seed = int(run.data.tags["seed"])
         asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
         if run.data.tags["config_sha"] == asked.sha():

@@ -68,7 +68,8 @@ def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]
 
 def _finished(settings: Config) -> bool:
     try:
-        return bool(compare.finished_runs(settings, DemonstrationData(settings).digest))
+        digest = DemonstrationData(settings).digest
+        return bool(compare.finished_runs(config_sha=settings.sha(), data_digest=digest))
     except DemonstrationError:
         return False  # the cell itself will say so, and the others go on
 

@@ -8,12 +8,14 @@ from matplotlib.figure import Figure
 from mlflow.entities import Run
 from rich.console import Console
 
-from conflow.experiment import diagnostics, tracking
+from conflow.experiment import compare, diagnostics, tracking
 from conflow.experiment.build import random_stream
+from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import Evaluation, cycle
 from conflow.experiment.figures import curves, workspace
 from conflow.experiment.figures.animation import animation
+from conflow.experiment.figures.front import front
 from conflow.experiment.finished import MODEL_FILE, demonstrations, load_model
 from conflow.experiment.module import SETTINGS, ConFlow
 
@@ -31,6 +33,16 @@ def draw(wanted: Sequence[str], console: Console) -> None:
     if len(runs) > 1:
         console.print("all runs: methods.png", highlight=False)
         workspace.save({"methods": workspace.methods(made)}, _folder())
+
+
+def draw_front(settings: Config, console: Console) -> None:
+    """Draw what fewer collisions cost, over all finished runs of a preset on its demonstrations."""
+    runs = compare.finished_runs(preset=settings.preset, data_digest=DemonstrationData(settings).digest)
+    if not runs:
+        console.print(f"front.png is left out, no run of preset {settings.preset} has finished", highlight=False)
+        return
+    workspace.save({"front": front(runs)}, _folder() / "explain")
+    console.print(f"front.png: unguided collisions of {len(runs)} finished runs, and what they cost", highlight=False)
 
 
 def _folder() -> Path:

@@ -1,0 +1,252 @@
+"""What the pictures of the theory show, compared with numbers computed another way."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.axes import Axes
+from matplotlib.container import ErrorbarContainer
+from matplotlib.figure import Figure
+from mlflow.entities import Metric, Param, Run, RunData, RunInfo, RunTag
+from rich.console import Console
+
+from conflow.experiment import config
+from conflow.experiment.build import build_source, robot_avoidance
+from conflow.experiment.config import Config
+from conflow.experiment.figures import explain
+from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations, expected, posterior
+from conflow.experiment.figures.front import front
+from conflow.flow import source
+from conflow.flow.correction import Correction, covariant, gaussian_filter
+from conflow.scene.constraint import Barrier
+from tests.conftest import Command
+
+
+@pytest.fixture(scope="module")
+def settings() -> Config:
+    """The paper's, with fewer demonstrations."""
+    return config.load(["data.num=1500"])
+
+
+@pytest.fixture(scope="module")
+def gap(settings: Config) -> Gap:
+    return Gap.of(settings)
+
+
+def curve(axis: Axes, label: str) -> np.ndarray:
+    """The values drawn under a label."""
+    (line,) = (line for line in axis.lines if str(line.get_label()).startswith(label))
+    return np.asarray(line.get_ydata())
+
+
+def check_labels(figure: Figure) -> None:
+    """Every axis says what it shows."""
+    for axis in figure.axes:
+        assert axis.get_ylabel()
+        assert axis.get_xlabel() or axis.get_label() == "<colorbar>"
+    assert figure.get_suptitle()
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3, 0.8])
+def test_posterior_of_a_gaussian(t: float) -> None:
+    """For z_1 ~ N(0, 4): E[z_1 | z_t] = 4 t z_t / (4 t^2 + (1 - t)^2)."""
+    z_1 = 2 * torch.special.ndtri((torch.arange(4000) + 0.5) / 4000)[:, None]
+    z = torch.linspace(-1, 1, 7)[:, None]
+    weights = posterior(z, z_1, t)
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(7))
+    # The quantiles stand for the law up to its tails.
+    torch.testing.assert_close(weights @ z_1, 4 * t * z / (4 * t**2 + (1 - t) ** 2), rtol=0, atol=2e-3)
+
+
+def test_the_exact_flow_reproduces_the_gaps_of_the_demonstrations(gap: Gap) -> None:
+    """Without correction: the collision rate of D, and all quantiles."""
+    ends = gap.paths(0.0)[-1]
+    assert gap.collision_rate(ends) == pytest.approx(gap.collision_rate(gap.g_1), abs=0.01)
+    levels = torch.linspace(0.05, 0.95, 19)
+    torch.testing.assert_close(ends.quantile(levels), gap.g_1.quantile(levels), rtol=0, atol=0.02)
+
+
+def test_in_one_dimension_a_large_weight_leaves_no_collision(gap: Gap) -> None:
+    assert gap.collision_rate(gap.paths(2.5)[-1]) < 0.01
+
+
+def test_gaps_collide_and_are_pushed_as_the_constraint_says(settings: Config, gap: Gap) -> None:
+    """The share of D- in g_1, and dg/dt = 2 dC/dc sign(g): both robots give way."""
+    violates = robot_avoidance(settings, 4).violation(demonstrations(settings))
+    assert gap.collision_rate(gap.g_1) == pytest.approx(float(violates.float().mean()), abs=0.02)
+    g = torch.tensor([[-1.0], [-0.2], [0.1], [0.5]])
+    slope = Barrier(gamma=settings.constraint.gamma).slope(g.abs() - settings.constraint.radius)
+    torch.testing.assert_close(gap.push(g), 2 * slope * g.sign())
+
+
+def test_the_picture_of_the_gap(settings: Config) -> None:
+    figure = explain.gap(settings)
+    check_labels(figure)
+    rates = curve(figure.axes[3], "exact flow")
+    assert rates[0] == pytest.approx(curve(figure.axes[3], "demonstrations")[0], abs=0.01)
+    assert (np.diff(rates) <= 0).all()
+    assert rates[-1] < 0.01
+
+
+def test_shifts_in_the_sources_deviations_have_the_cameron_martin_norm(settings: Config) -> None:
+    """|e_k^T u|^2 / lambda_k, summed over k, is u^T Sigma^-1 u."""
+    paper = build_source(settings.source, 32)
+    u = torch.zeros(3, 32, 4, dtype=torch.float64)
+    u[:, 1:-1] = torch.randn(3, 30, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    inner = u[:, 1:-1]
+    expected = (inner * torch.linalg.solve(paper.covariance[1:-1, 1:-1], inner)).sum(dim=1)
+    # Sigma's condition number is 1e7.
+    torch.testing.assert_close(explain.in_deviations(paper, u).square().sum(dim=1), expected, rtol=1e-6, atol=0)
+
+
+def test_the_filters_content_in_trailing_modes_is_orders_of_magnitude_larger(settings: Config) -> None:
+    figure = explain.support(settings)
+    check_labels(figure)
+    filtered, shaped = curve(figure.axes[1], "filter"), curve(figure.axes[1], "covariant")
+    assert filtered[0] == pytest.approx(shaped[0], rel=0.5)  # the one mode in which both push alike
+    assert (filtered[8:] > 1e3 * shaped[8:]).all()
+    assert filtered[4:8].min() > 1
+    assert shaped.max() < 1
+
+
+def test_widths_are_those_of_both_kernels(settings: Config) -> None:
+    figure = explain.eigenvalues(settings)
+    check_labels(figure)
+    x = demonstrations(settings)
+    feasible = x[~robot_avoidance(settings, 4).violation(x)]
+    floor = settings.source.epsilon**0.5
+    for length_scale, sigma_f in ((0.4, 1.0), source.fit_rbf(feasible, source.ENDPOINTS)):
+        Sigma = source.cgp(32, length_scale, sigma_f).covariance.numpy()[1:-1, 1:-1]
+        drawn = curve(figure.axes[0], rf"source, $\ell = {length_scale:.2f}$")
+        np.testing.assert_allclose(drawn, np.sqrt(np.linalg.eigvalsh(Sigma)[::-1]), rtol=1e-5)
+        np.testing.assert_allclose(drawn[8:], floor, rtol=0.05)
+        assert curve(figure.axes[0], rf"$D^+$ in its modes, $\ell = {length_scale:.2f}$")[8:].max() < 0.1 * floor
+
+
+def test_a_lone_demonstration_is_expected_from_everywhere(settings: Config) -> None:
+    nominal = config.load(["data.num=10", "data.jitter=0"])
+    x_1, cgp = demonstrations(nominal), build_source(settings.source, 32)
+    assert torch.equal(expected(cgp, x_1[:1], 0.4).end, x_1[:1])
+    start, late = expected(cgp, x_1, 0.0), expected(cgp, x_1, 0.99)
+    torch.testing.assert_close(start.end, x_1.mean(dim=0).expand_as(x_1))  # nothing is known at t = 0
+    torch.testing.assert_close(late.end, x_1)
+    torch.testing.assert_close(late.x_t, 0.01 * start.x_t + 0.99 * x_1)
+
+
+def test_the_predicted_end_collides_early_and_x_t_late(settings: Config) -> None:
+    figure = explain.predicted_end(settings)
+    check_labels(figure)
+    shares, pushes, told = figure.axes
+    at, end = curve(shares, "at $x_t$"), curve(shares, "at the predicted end")
+    assert end[0] == 1  # the mean of all ways around each other leads through the middle
+    assert end[-1] == 0
+    assert (at[12:] > end[12:]).all()
+    plain, weighted = curve(pushes, r"at the end: "), curve(pushes, r"at the end, times t")
+    np.testing.assert_allclose(weighted, plain * np.arange(25) / 25, rtol=1e-5)
+    best = curve(told, "$E[M")
+    assert (best[10:] >= np.maximum(curve(told, "$x_t$"), curve(told, "the predicted"))[10:] - 0.03).all()
+
+
+def test_a_clearing_time_is_inverse_to_the_scale(settings: Config) -> None:
+    """And found without stepping over: half the step finds the same to a step."""
+    x = demonstrations(settings)[:300]
+    constraint = robot_avoidance(settings, 4)
+    x, S = x[constraint.violation(x)], covariant(source.cgp(32).covariance)
+    once = clearing_time(Correction(constraint, S), x)
+    assert clearing_time(Correction(constraint, 2 * S), x, h=0.005) == pytest.approx(once / 2, abs=0.006)
+    assert clearing_time(Correction(constraint, S), x, h=0.005) == pytest.approx(once, abs=0.011)
+    cleared = clearing_times(settings, 32, 0.4)
+    assert set(cleared) == set(explain.LOOKS)
+
+
+def test_lambda_keeps_its_meaning_with_row_sums_alone(settings: Config) -> None:
+    """Over T and length scale; each of the four times against a run with that very matrix."""
+    few, many, long = (clearing_times(settings, *at) for at in ((16, 0.4), (64, 0.4), (32, 1.6)))
+    assert many[explain.ROW_SUM] == pytest.approx(few[explain.ROW_SUM], rel=0.1)
+    assert long[explain.ROW_SUM] == pytest.approx(few[explain.ROW_SUM], rel=0.15)
+    for name in (explain.PEAKED, explain.SIGMA, explain.FILTERED):
+        assert few[name] > 1.5 * many[name]
+    assert long[explain.SIGMA] > 50 * few[explain.SIGMA]
+
+    x = demonstrations(config.load(["data.num=1000"]))
+    constraint, Sigma = robot_avoidance(settings, 4), source.cgp(32, 1.6).covariance
+    x = x[constraint.violation(x)]
+    for name, S in (
+        (explain.PEAKED, Sigma / Sigma.max()),
+        (explain.SIGMA, Sigma),
+        (explain.FILTERED, gaussian_filter(32)),
+    ):
+        step = long[name] / 50
+        assert clearing_time(Correction(constraint, S), x, step) == pytest.approx(long[name], rel=0.05)
+
+
+def test_the_picture_of_lambda(settings: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(explain, "HORIZONS", (16, 32))
+    monkeypatch.setattr(explain, "LENGTH_SCALES", (0.4, 0.8))
+    figure = explain.lambda_scale(settings)
+    assert figure.get_suptitle()
+    for axis in figure.axes:
+        assert axis.get_xlabel()
+        assert len(axis.lines) == len(explain.LOOKS)
+    # T = 32 and length scale 0.4 stand in both panels.
+    for by_horizon, by_length in zip(*(axis.lines for axis in figure.axes), strict=True):
+        assert np.asarray(by_horizon.get_ydata())[1] == np.asarray(by_length.get_ydata())[0]
+
+
+def test_every_picture_is_written_and_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line a picture: its file and what it finds; drawn again, it is overwritten."""
+    monkeypatch.chdir(tmp_path)
+    names = ["gap", "support", "eigenvalues", "predicted_end", "lambda_scale"]
+
+    def picture(settings: Config) -> Figure:
+        figure = Figure(figsize=(1, 1))
+        figure.suptitle(f"{settings.ablation}\nin two lines")
+        return figure
+
+    for name in names:
+        monkeypatch.setattr(explain, name, picture)
+    console = Console(record=True, width=140)
+    for _ in range(2):
+        explain.draw(config.load(), console)
+    *lines, where = console.export_text().splitlines()[: len(names) + 1]
+    assert lines == [f"{name}.png: cgp in two lines" for name in names]
+    assert "runs/figures/explain" in where
+    written = tmp_path / "runs" / "figures" / "explain"
+    assert sorted(path.name for path in written.iterdir()) == sorted(f"{name}.png" for name in names)
+
+
+def test_explain_takes_a_preset_alone(conflow: Command) -> None:
+    for argument, said in {"seed=1": "seed: no such option, expected preset", "preset=quik": "mean quick?"}.items():
+        answer = conflow("explain", argument)
+        assert answer.returncode == 2
+        assert said in answer.stderr
+        assert answer.stderr.count("\n") == 1
+
+
+def run(ablation: str, lambda_c: float, count: int, distance: float | None, at: str = "point") -> Run:
+    metrics = {"robot_collision_count": count, "num": 1000.0} | (
+        {} if distance is None else {"energy_distance": distance}
+    )
+    return Run(
+        RunInfo("id", "0", "user", "FINISHED", 0, 1, "active"),
+        RunData(
+            [Metric(f"test/none/{key}", value, 0, 0) for key, value in metrics.items()],
+            [Param("correction.lambda_c", str(lambda_c)), Param("correction.at", at)],
+            [RunTag("ablation", ablation)],
+        ),
+    )
+
+
+def test_the_front_shows_every_run_once_and_a_curve_where_the_weight_varies() -> None:
+    """Rates are counts over numbers; runs without an energy distance are left out."""
+    runs = [run("plus", 24, 0, 0.004, "end"), run("plus", 3, 7, 0.001, "end"), run("cgp", 2.5, 300, 0.03)]
+    weights, distances = front([*runs, run("fm", 0, 270, None)]).axes
+    assert points(weights) == {"plus": [[3, 0.007], [24, 0.0]]}
+    assert points(distances) == {"cgp": [[0.03, 0.3]], "plus": [[0.001, 0.007], [0.004, 0.0]]}
+
+
+def points(axis: Axes) -> dict[object, list[list[float]]]:
+    """What stands under each label."""
+    bars = [container for container in axis.containers if isinstance(container, ErrorbarContainer)]
+    return {bar.get_label(): np.asarray(bar.lines[0].get_xydata()).tolist() for bar in bars}
