@@ -371,6 +371,8 @@ def _text(cell: Cell) -> str:
     parts = [f"{cell.value:.4f}"]
     if cell.low is not None:
         parts[0] += f" [{cell.low:.4f}, {cell.high:.4f}]"
+    if cell.count is not None:
+        parts.append(f"{cell.count} of {cell.trajectories}")
     if cell.seeds > 1:
         parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
     if cell.paper is not None:
