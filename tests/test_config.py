@@ -28,8 +28,9 @@ CHANGES = {
 }
 CHANGES["plus"] = (CHANGES["end"] | CHANGES["spectral"] | CHANGES["fitted"] | CHANGES["few_steps"]) | {
     "constraint.gamma",
-    "train.batch_size",
+    "train.max_steps",
     "sample.num",
+    "sample.robot_weight",
     "sample.obstacle_weight",
 }
 

@@ -1,10 +1,15 @@
+import os
 import shutil
+import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
+from mlflow import MlflowClient
 from mlflow.artifacts import list_artifacts
+from mlflow.entities import Run
 
-from conflow.experiment import config, tracking
+from conflow.experiment import config, signals, tracking
 from conflow.experiment.datamodule import DemonstrationData
 
 
@@ -69,3 +74,30 @@ def test_a_run_that_raises_is_failed_and_keeps_its_metrics(store_folder: Path) -
     run = tracking.client().get_run(ids[0])
     assert run.info.status == "FAILED"
     assert run.data.metrics["train/loss"] == 0.5
+
+
+def test_a_signal_while_the_store_makes_the_run_leaves_no_run_that_says_running(
+    store_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The signal comes after the store's commit and before its answer."""
+    created: list[str] = []
+    create_run = MlflowClient.create_run
+
+    def interrupted(client: MlflowClient, *arguments: Any, **options: Any) -> Run:
+        run = create_run(client, *arguments, **options)
+        created.append(run.info.run_id)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return run
+
+    monkeypatch.setattr(MlflowClient, "create_run", interrupted)
+    settings = config.load(["preset=smoke"])
+    data = DemonstrationData(settings)
+    handlers = {signum: signal.getsignal(signum) for signum in signals.SIGNALS}
+    signals.raise_on_signals()
+    try:
+        with pytest.raises(signals.Interrupted, match="SIGTERM"), tracking.start(settings, data):
+            pytest.fail("the run began")
+    finally:
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)
+    assert tracking.client().get_run(created[0]).info.status == "KILLED"

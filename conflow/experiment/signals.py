@@ -1,7 +1,11 @@
 """Signals that ask a command to end, as an exception."""
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(BaseException):
@@ -18,5 +22,23 @@ def raise_on_signals() -> None:
     def interrupt(signum: int, _: FrameType | None) -> None:
         raise Interrupted(signum)
 
-    for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for signum in SIGNALS:
         signal.signal(signum, interrupt)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Signals that arrive within the block act where it ends."""
+    arrived: list[int] = []
+
+    def keep(signum: int, _: FrameType | None) -> None:
+        arrived.append(signum)
+
+    handlers = {signum: signal.signal(signum, keep) for signum in SIGNALS}
+    try:
+        yield
+    finally:
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)
+        if arrived:
+            signal.raise_signal(arrived[0])

@@ -20,7 +20,7 @@ from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
 
 from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.signals import Interrupted
+from conflow.experiment.signals import Interrupted, held
 
 # MLflow tells every user about every table of a new store,
 logging.getLogger("mlflow.store.db.utils").setLevel(logging.WARNING)
@@ -134,11 +134,13 @@ def start(config: Config, data: DemonstrationData) -> Iterator[RunLogger]:
     store = client()
     experiment = store.get_experiment_by_name(EXPERIMENT)
     assert experiment is not None
-    run = store.create_run(experiment.experiment_id, run_name=f"{config.ablation}-s{config.seed}", tags=_tags(config))
-    run_id = run.info.run_id
-    logger = RunLogger(store, run_id)
-    status = "FAILED"
+    name, tags, status = f"{config.ablation}-s{config.seed}", _tags(config), "FAILED"
+    logger: RunLogger | None = None
     try:
+        # A signal between the store's commit and its answer would leave a run that nobody knows of to end.
+        with held():
+            run_id = store.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id
+            logger = RunLogger(store, run_id)
         params = [Param(key, str(value)) for key, value in flatten(config.tree()).items()]
         store.log_batch(run_id, params=params)
         store.log_dict(run_id, config.tree(), "config.yaml")
@@ -149,8 +151,9 @@ def start(config: Config, data: DemonstrationData) -> Iterator[RunLogger]:
         status = "KILLED"
         raise
     finally:
-        logger.save()
-        store.set_terminated(run_id, status)
+        if logger is not None:
+            logger.save()
+            store.set_terminated(run_id, status)
 
 
 def _tags(config: Config) -> dict[str, str]:
