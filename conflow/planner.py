@@ -140,8 +140,8 @@ class Planner:
         if goal.shape != start.shape:
             raise PlanError(f"goal: found shape {tuple(goal.shape)}, expected that of start, {tuple(start.shape)}")
         points = _via_points(via, self.model.T, self.model.D)
-        discs = [self._avoidance(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
-        constraint = Sum([self.model.robots, *discs])
+        discs = [_obstacle(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
+        constraint = Sum([self.model.robots, *map(self._avoidance, discs)])
         named = {"start": start, "goal": goal} | {f"via[{i}]": point for i, point in enumerate(points.values())}
         for name, position in named.items():
             _refuse_collision(name, position, constraint)
@@ -155,7 +155,7 @@ class Planner:
     def _field(
         self,
         guidance: Guidance | None,
-        obstacles: Sequence[Constraint],
+        obstacles: Sequence[Obstacle],
         robot_weight: float | None,
         obstacle_weight: float | None,
     ) -> Field:
@@ -172,14 +172,17 @@ class Planner:
         if guidance in ("robot", "both"):
             v = self.model.guided(v, self.model.u_c, lambda_r)
         if guidance in ("obstacle", "both") and obstacles:
-            v = self.model.guided(v, Correction(Sum(obstacles), self.model.u_c.smoothing), lambda_o)
+            # Guided as in training, with its margin; judged without.
+            near = Sum([self._avoidance(disc, self.model.config.correction.margin) for disc in obstacles])
+            v = self.model.guided(v, Correction(near, self.model.u_c.smoothing), lambda_o)
         return v
 
-    def _avoidance(self, name: str, disc: Obstacle | Sequence[float]) -> Constraint:
+    def _avoidance(self, disc: Obstacle, margin: float = 0.0) -> Constraint:
         """The run's constraint, with its barrier, for another obstacle."""
         settings = self.model.config
-        sample = replace(settings.sample, obstacle=_obstacle(name, disc))
-        return obstacle_avoidance(replace(settings, sample=sample), self.model.D)
+        return obstacle_avoidance(
+            replace(settings, sample=replace(settings.sample, obstacle=disc)), self.model.D, margin
+        )
 
     def _sample(self, v: Field, y: Tensor, index: Sequence[int], num: int, seed: int) -> Tensor:
         """`num` trajectories for each row of y (B, O, D), which they meet at the waypoints `index`: (B, num, T, D)."""

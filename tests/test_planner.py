@@ -183,6 +183,18 @@ def test_guidance_moves_plans_away_from_what_it_avoids_and_in_proportion_to_its_
     assert both.clearance.mean() > obstacles[2]
 
 
+def test_guidance_around_obstacles_keeps_the_margin_of_training_and_judges_without() -> None:
+    """A barrier that is 0 where feasible leaves the wider berth to the margin alone."""
+    discs = [(0.0, 0.5, 0.1)]
+    clearances = []
+    for margin in (0.0, 0.2):
+        still = planner("constraint.barrier=relu", f"correction.margin={margin}", still=True)
+        plans = still.plan(START, GOAL, guidance="obstacle", obstacles=discs, obstacle_weight=1)
+        clearances.append(plans.clearance.mean())
+        assert plans.clearance[0] == pytest.approx(clearance(plans.x[0], discs), abs=1e-6)
+    assert clearances[0] < clearances[1]
+
+
 def test_guidance_is_around_robots_always_and_around_obstacles_where_there_are_some() -> None:
     flow = planner(still=True)
     assert torch.equal(flow.plan(START, GOAL, 9).x, flow.plan(START, GOAL, 9, guidance="robot").x)
