@@ -27,7 +27,7 @@ from conflow.experiment.config import ConfigError, nearest
 from conflow.experiment.figures.workspace import COLLISION, OBSTACLE, ROBOTS
 from conflow.experiment.finished import MODEL_FILE, load_model
 from conflow.experiment.metrics import smoothness, wilson
-from conflow.experiment.module import ConFlow
+from conflow.experiment.module import ConFlow, start_and_goal
 from conflow.experiment.tracking import artifact, find_run
 from conflow.flow.correction import Correction
 from conflow.flow.sampler import Field, integrate
@@ -145,15 +145,18 @@ class Planner:
         named = {"start": start, "goal": goal} | {f"via[{i}]": point for i, point in enumerate(points.values())}
         for name, position in named.items():
             _refuse_collision(name, position, constraint)
-        v = self._field(guidance, discs, robot_weight, obstacle_weight)
 
         y = torch.stack([start, *(point.expand_as(start) for point in points.values()), goal], dim=-2)
-        x = self._sample(v, y.reshape(-1, *y.shape[-2:]), (0, *points, -1), num, seed)
+        y = y.reshape(-1, *y.shape[-2:])
+        ends = start_and_goal(y).repeat_interleave(num, dim=0)
+        v = self._field(ends, guidance, discs, robot_weight, obstacle_weight)
+        x = self._sample(v, y, (0, *points, -1), num, seed)
         plans = _ranked(x, constraint)
         return plans if start.ndim == 2 else plans[0]
 
     def _field(
         self,
+        ends: Tensor,
         guidance: Guidance | None,
         obstacles: Sequence[Obstacle],
         robot_weight: float | None,
@@ -168,7 +171,7 @@ class Planner:
         sample = self.model.config.sample
         lambda_r = _weight("robot_weight", robot_weight, sample.robot_weight)
         lambda_o = _weight("obstacle_weight", obstacle_weight, sample.obstacle_weight)
-        v: Field = self.model.v
+        v = self.model.field("none", ends)
         if guidance in ("robot", "both"):
             v = self.model.guided(v, self.model.u_c, lambda_r)
         if guidance in ("obstacle", "both") and obstacles:

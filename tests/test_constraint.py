@@ -86,10 +86,11 @@ def test_the_gradient_is_the_limit_of_finite_differences(
 def test_the_barrier_of_a_trajectory_made_by_hand(reduction: Reduction) -> None:
     """C written out for distances 0.5, 0.15 and 0.3 with r = 0.25 and gamma = 10."""
     distances = (0.5, 0.15, 0.3)
-    counted = distances if reduction == "waypoint" else (min(distances),)
+    counted = (min(distances),) if reduction == "closest" else distances
+    share = 1 / 3 if reduction == "mean" else 1
     softplus = sum(-math.log(1 + math.exp(-10 * (d - 0.25))) / 10 for d in counted)
     relu = sum(min(d - 0.25, 0) for d in counted)
-    shapes: tuple[tuple[BarrierShape, float], ...] = (("softplus", softplus), ("relu", relu))
+    shapes: tuple[tuple[BarrierShape, float], ...] = (("softplus", share * softplus), ("relu", share * relu))
     for shape, expected in shapes:
         C = RobotAvoidance(TWO, 0.25, Barrier(shape, reduction, gamma=10)).barrier(apart(*distances))
         assert C.tolist() == pytest.approx([expected], abs=1e-14)  # float64 rounding
@@ -99,9 +100,10 @@ def test_the_barrier_of_a_trajectory_made_by_hand(reduction: Reduction) -> None:
 def test_the_gradient_of_a_trajectory_made_by_hand(reduction: Reduction) -> None:
     """The robots are pushed apart along the line between them, by the logistic function of -gamma (d - r)."""
     distances = (0.5, 0.15, 0.3)
+    share = 1 / 3 if reduction == "mean" else 1
     gradient = RobotAvoidance(TWO, 0.25, Barrier("softplus", reduction, gamma=10)).gradient(apart(*distances))
     for d, (x_1, y_1, x_2, y_2) in zip(distances, gradient[0].tolist(), strict=True):
-        slope = 1 / (1 + math.exp(10 * (d - 0.25))) if reduction == "waypoint" or d == 0.15 else 0
+        slope = share / (1 + math.exp(10 * (d - 0.25))) if reduction != "closest" or d == 0.15 else 0
         assert (x_1, y_1, x_2, y_2) == pytest.approx((slope, 0, -slope, 0), abs=1e-14)  # float64 rounding
 
 
@@ -112,7 +114,7 @@ def test_softplus_stays_below_relu_and_approaches_it(reduction: Reduction, gamma
     x = trajectories()
     relu = RobotAvoidance(TWO, barrier=Barrier("relu", reduction)).barrier(x)
     softplus = RobotAvoidance(TWO, barrier=Barrier("softplus", reduction, gamma)).barrier(x)
-    counted = x.shape[1] if reduction == "waypoint" else 1
+    counted = x.shape[1] if reduction == "sum" else 1
     gap = relu - softplus
     assert bool((gap >= 0).all())
     assert bool((gap <= counted * math.log(2) / gamma + 1e-14).all())  # float64 rounding

@@ -1,12 +1,14 @@
 """The smoothed correction u^c: the Gaussian filter against SciPy's, the covariant one, and repair by it."""
 
+from typing import get_args
+
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from conflow.flow import source
-from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
+from conflow.flow.correction import Correction, Edges, covariant, gaussian_filter, repair
 from conflow.scene.constraint import Barrier, RobotAvoidance
 from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import swap
@@ -29,12 +31,20 @@ widths = pytest.mark.parametrize(("T", "sigma", "width"), [(32, 5.0, 9), (32, 0.
 
 
 @widths
-def test_the_filter_is_scipys(T: int, sigma: float, width: int) -> None:
-    """S g is gaussian_filter1d of g with zeros beyond the ends, `width` taps or, if even, one fewer."""
+@pytest.mark.parametrize("edges", get_args(Edges))
+def test_the_filter_is_scipys(T: int, sigma: float, width: int, edges: Edges) -> None:
+    """S g is gaussian_filter1d of g, `width` taps or, if even, one fewer; normalised: divided by that of ones."""
     g = torch.randn(T, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    expected = gaussian_filter1d(g.numpy(), sigma, axis=0, mode="constant", radius=(width - 1) // 2)
+    mode = "nearest" if edges == "nearest" else "constant"
+    expected, ones = (
+        gaussian_filter1d(values.numpy(), sigma, axis=0, mode=mode, radius=(width - 1) // 2)
+        for values in (g, torch.ones_like(g))
+    )
+    found = gaussian_filter(T, sigma, width, edges) @ g
     # float64 rounding
-    torch.testing.assert_close(gaussian_filter(T, sigma, width) @ g, torch.from_numpy(expected), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        found, torch.from_numpy(expected / ones if edges == "normalised" else expected), rtol=0, atol=1e-14
+    )
 
 
 @widths

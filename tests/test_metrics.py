@@ -20,8 +20,10 @@ from conflow.experiment.metrics import (
     SweptCollisionRate,
     endpoint_error,
     path_length,
+    peak_acceleration,
     quantile_interval,
     smoothness,
+    squared_acceleration,
     trajectory_metrics,
     wilson,
 )
@@ -96,6 +98,17 @@ def test_smoothness_of_constant_speed_is_zero_and_of_a_parabola_its_acceleration
     x = torch.zeros(1, 6, 4)
     x[0, :, 0], x[0, :, 1] = 0.03 * s**2, 0.04 * s**2  # second difference (0.06, 0.08), of norm 0.1
     assert smoothness(x).item() == pytest.approx(0.05)  # the other robot stands still
+    assert peak_acceleration(x).item() == pytest.approx(0.05)
+    assert squared_acceleration(x).item() == pytest.approx(0.005)
+
+
+def test_a_single_kink_shows_in_full_in_the_peak_and_diluted_in_the_mean() -> None:
+    """Positions 0, 0, 0, 1, 2, 3 of one robot: one second difference of 1 among four, the other robot stands still."""
+    x = torch.zeros(1, 6, 4)
+    x[0, :, 0] = torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0])
+    assert smoothness(x).item() == pytest.approx(1 / 8)
+    assert peak_acceleration(x).item() == pytest.approx(1 / 2)
+    assert squared_acceleration(x).item() == pytest.approx(1 / 8)
 
 
 def test_endpoint_errors_are_distances_per_robot() -> None:

@@ -6,8 +6,9 @@ from torch import Tensor
 from conflow.experiment import config
 from conflow.experiment.build import fitted, random_stream
 from conflow.experiment.config import Config
+from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.metrics import smoothness
-from conflow.experiment.module import SETTINGS, ConFlow, Setting
+from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
 from conflow.flow.path import guided_path, interpolate
 from conflow.flow.sampler import integrate
 from conflow.flow.source import ENDPOINTS, fit_rbf
@@ -35,7 +36,7 @@ def test_where_nothing_violates_the_guided_loss_is_that_of_flow_matching() -> No
     assert not torch.equal(guided.loss(x_1, ~feasible, noise()), plain.loss(x_1, ~feasible, noise()))
 
 
-@pytest.mark.parametrize("reduction", ["waypoint", "closest"])
+@pytest.mark.parametrize("reduction", ["sum", "mean", "closest"])
 def test_the_loss_is_algorithm_1_written_out(reduction: str) -> None:
     """Gradient by autograd, smoothing by a convolution, conditioning left to the tested source."""
     flow = model(f"constraint.reduction={reduction}")
@@ -46,8 +47,8 @@ def test_the_loss_is_algorithm_1_written_out(reduction: str) -> None:
     t = torch.rand(300, generator=draws)[:, None, None]
     x_t = ((1 - t) * x_0 + t * x_1).requires_grad_()
     d = (x_t[..., :2] - x_t[..., 2:]).norm(dim=-1)
-    d = d if reduction == "waypoint" else d.amin(dim=1, keepdim=True)
-    C = -torch.log(1 + torch.exp(-10 * (d - 0.3))) / 10
+    d = d.amin(dim=1, keepdim=True) if reduction == "closest" else d
+    C = -torch.log(1 + torch.exp(-10 * (d - 0.3))) / 10 / (32 if reduction == "mean" else 1)
     (g,) = torch.autograd.grad(C.sum(), x_t)
     w = torch.exp(-(torch.arange(-4.0, 5.0) ** 2) / (2 * 5.0**2))
     u_c = F.conv1d(g.mT.reshape(-1, 1, 32), (w / w.sum()).view(1, 1, 9), padding=4).view(300, 4, 32).mT
@@ -69,29 +70,65 @@ def test_a_training_step_is_a_function_of_seed_step_and_batch() -> None:
 
 def test_without_guidance_a_sample_is_the_flow_of_the_network_alone() -> None:
     flow = model()
-    y = flow.source.observe(swap(20))
-    expected = integrate(flow.v, flow.source.sample(y, noise()), 10, "euler")
-    assert torch.equal(flow.sample(y, "none", noise()), expected)
+    x_1 = swap(20)
+    expected = integrate(flow.v, flow.source.sample(flow.source.observe(x_1), noise()), 10, "euler")
+    assert torch.equal(flow.sample(x_1, "none", noise()), expected)
 
 
 def test_guidance_moves_samples_away_from_what_it_avoids_and_in_proportion_to_its_weight() -> None:
-    y = swap(400)[:, [0, -1]]
+    x_1 = swap(400)
     base, strong = model(), model("sample.robot_weight=3", "sample.obstacle_weight=3")
     for flow in (base, strong):
         torch.nn.init.zeros_(flow.v.outlet.weight)  # a field that stands still leaves guidance alone
         torch.nn.init.zeros_(flow.v.outlet.bias)
     clearance = {
         name: [
-            flow.robots.clearance(flow.sample(y, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
+            flow.robots.clearance(flow.sample(x_1, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
         ]
         for name, flow in (("base", base), ("strong", strong))
     }
     none, robot, _ = clearance["base"]
     assert none < robot < clearance["strong"][1]
     obstacle = [
-        base.obstacle.clearance(base.sample(y, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
+        base.obstacle.clearance(base.sample(x_1, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
     ]
     assert obstacle[2] > obstacle[0]
+
+
+def test_the_mask_may_be_read_as_feasible() -> None:
+    """Algorithm 1's caption against the text: where nothing violates, everything is corrected, and the reverse."""
+    x_1, nothing = swap(100), torch.zeros(100, dtype=torch.bool)
+    violates, feasible = model(), model("correction.mask=feasible")
+    feasible.load_state_dict(violates.state_dict())
+    assert torch.equal(feasible.loss(x_1, nothing, noise()), violates.loss(x_1, ~nothing, noise()))
+    assert torch.equal(feasible.loss(x_1, ~nothing, noise()), violates.loss(x_1, nothing, noise()))
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "cgp"])
+def test_a_network_that_sees_the_ends_asks_for_them_and_uses_them(kind: str) -> None:
+    flow, x_1 = model("network.sees_ends=true", f"source.kind={kind}"), swap(10)
+    x_0, t = flow.source.sample(flow.source.observe(x_1), noise()), torch.zeros(10)
+    ends = start_and_goal(x_1)
+    assert not torch.equal(flow.v(x_0, t, ends), flow.v(x_0, t, ends + 0.1))
+    # Every setting passes them on.
+    for setting in SETTINGS:
+        assert not torch.equal(flow.flow(x_0, setting, ends), flow.flow(x_0, setting, ends + 0.1))
+    with pytest.raises(ValueError, match="expected starts and goals"):
+        flow.flow(x_0)
+
+
+def test_samples_may_be_judged_at_another_distance_than_they_were_trained_for() -> None:
+    """The label M, the barrier and the network keep the constraint's radius."""
+    here, x = model("sample.radius=0.25"), swap(500)
+    assert torch.equal(here.robots.violation(x), closest(x) < 0.25)
+    assert torch.equal(here.u_c(x), model().u_c(x))
+    assert torch.equal(DemonstrationData(here.config).violates, DemonstrationData(model().config).violates)
+
+
+def test_a_correction_may_leave_alone_what_the_source_fixes() -> None:
+    u_c = model("correction.keep_ends=true").u_c(swap(100) * 0.1)  # robots near each other everywhere
+    assert bool((u_c[:, [0, -1]] == 0).all())
+    assert bool((u_c[:, 1] != 0).any())
 
 
 def test_samples_start_as_smooth_as_the_source() -> None:
@@ -110,8 +147,7 @@ def test_a_fitted_kernel_comes_from_the_demonstrations_and_survives_reloading() 
     assert fitting.source.length_scale != settings.source.length_scale
     one, again = ConFlow(fitting, 32, 4), ConFlow(config.from_tree(fitting.tree()), 32, 4)
     again.load_state_dict(one.state_dict())
-    y = one.source.observe(x)
-    assert torch.equal(one.sample(y, "none", noise()), again.sample(y, "none", noise()))
+    assert torch.equal(one.sample(x, "none", noise()), again.sample(x, "none", noise()))
 
 
 def test_without_fit_the_kernel_stays_as_it_is_set(smoke: Config) -> None:
@@ -123,11 +159,11 @@ def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("autograd on the sampling path")
 
     flow = model()
-    y = flow.source.observe(swap(8))
+    x_1 = swap(8)
     monkeypatch.setattr(torch.autograd, "grad", forbidden)
     monkeypatch.setattr(torch.autograd, "backward", forbidden)
     for setting in SETTINGS:
-        assert not flow.sample(y, setting, noise()).requires_grad
+        assert not flow.sample(x_1, setting, noise()).requires_grad
 
 
 def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes() -> None:
@@ -189,9 +225,8 @@ def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: 
     flow = model("ablation=plus", "source.fit=false")
     flow.fit(x_1)
     torch.nn.init.normal_(flow.v.outlet.weight, std=0.1)
-    y = flow.source.observe(x_1)
-    x = flow.sample(y, setting, noise())
-    assert torch.equal(flow.source.observe(x), y)
+    x = flow.sample(x_1, setting, noise())
+    assert torch.equal(flow.source.observe(x), flow.source.observe(x_1))
 
 
 def test_guidance_of_plus_acts_where_its_training_does() -> None:

@@ -109,7 +109,7 @@ def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Ru
     test = DemonstrationData(model.config).test.x
     x_1, reference = test[torch.arange(64) % 50], test[~model.robots.violation(test)]
     for setting in SETTINGS:
-        x = model.sample(model.source.observe(x_1), setting, random_stream("test samples", 3))
+        x = model.sample(x_1, setting, random_stream("test samples", 3))
         metrics = trajectory_metrics(model.robots, model.obstacle, reference)
         metrics.update(x=x, x_1=x_1)
         for key, value in metrics.compute().items():
@@ -191,7 +191,7 @@ def test_evaluating_again_adds_to_the_run_and_changes_nothing_that_it_had(
     prefix = "evaluate/sample.solver:midpoint sample.steps:3 seed:8"
     model = load_model(artifacts(before) / "model.ckpt", ["sample.steps=3", "sample.solver=midpoint", "seed=8"])
     x_1 = DemonstrationData(model.config).test.x[torch.arange(64) % 50]
-    x = model.sample(model.source.observe(x_1), "robot", random_stream("test samples", 8))
+    x = model.sample(x_1, "robot", random_stream("test samples", 8))
     counted = after.data.metrics[f"{prefix}/robot/robot_collision_count"]
     assert counted == model.robots.violation(x).sum()
     assert (artifacts(before) / f"{prefix}.yaml").exists()

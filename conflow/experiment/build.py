@@ -36,8 +36,13 @@ def fitted(settings: Config, demonstrations: Tensor) -> Config:
     return replace(settings, source=replace(settings.source, length_scale=length_scale, sigma_f=sigma_f))
 
 
+def judge(settings: Config, D: int) -> Constraint:
+    """The constraint that samples are judged by."""
+    return RobotAvoidance(PointRobots(D // 2), settings.sample.radius or settings.constraint.radius)
+
+
 def robot_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:
-    """The constraint that labels, corrects, guides and judges: robots keep their distance, and a margin."""
+    """The constraint that labels, corrects and guides: robots keep their distance, and a margin."""
     return RobotAvoidance(PointRobots(D // 2), settings.constraint.radius + margin, _barrier(settings.constraint))
 
 
@@ -51,14 +56,17 @@ def correction(settings: config.Correction, constraint: Constraint, source: Sour
     """u^c of a constraint, smoothed as the settings say."""
     if settings.smoothing == "covariant":
         return Correction(constraint, covariant(source.covariance))
-    return Correction(constraint, gaussian_filter(len(source.prior), settings.sigma, settings.width))
+    smoothing = gaussian_filter(len(source.prior), settings.sigma, settings.width, settings.edges)
+    if settings.keep_ends:
+        smoothing[source.index] = 0
+    return Correction(constraint, smoothing)
 
 
 def network(settings: config.Network, source: Source, D: int, constraint: Constraint) -> ResMLP | SpectralMLP:
     """The velocity network v_theta."""
     if settings.kind == "spectral":
         return SpectralMLP(source, D, constraint, settings.hidden, settings.blocks)
-    return ResMLP(len(source.prior), D, settings.hidden, settings.blocks)
+    return ResMLP(len(source.prior), D, settings.hidden, settings.blocks, settings.sees_ends)
 
 
 def repaired(settings: Config, x: Tensor) -> Tensor:

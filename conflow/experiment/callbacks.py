@@ -84,7 +84,7 @@ class Evaluate(Callback):
         x_1 = cycle(self.data.val.x, min(VALIDATION_SAMPLES, model.config.sample.num)).to(model.device)
         noise = random_stream("validation samples", model.config.seed, device=model.device)
         rate = CollisionRate("robot_collision", model.robots).to(model.device)
-        rate.update(model.sample(model.source.observe(x_1), "none", noise))
+        rate.update(model.sample(x_1, "none", noise))
         metrics = {f"val/none/{name}": value for name, value in rate.compute().items()}
         # val/loss goes along: Lightning would log it at the step before.
         metrics["val/loss"] = float(trainer.callback_metrics["val/loss"])

@@ -16,6 +16,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from conflow.flow.correction import Edges
 from conflow.flow.sampler import Solver
 from conflow.scene.constraint import BarrierShape, Obstacle, Reduction
 
@@ -26,6 +27,7 @@ Schedule = Literal["constant", "one_cycle"]
 NetworkKind = Literal["resmlp", "spectral"]
 Smoothing = Literal["filter", "covariant"]
 Place = Literal["point", "end"]
+Mask = Literal["violates", "feasible"]
 PathKind = Literal["linear", "guided"]
 Tree = dict[str, Any]
 
@@ -93,12 +95,15 @@ class Constraint:
 @dataclass(frozen=True)
 class Correction:
     lambda_c: Weight
+    mask: Mask
     at: Place
     path: PathKind
     margin: Annotated[float, Range(0, 1)]
     smoothing: Smoothing
     sigma: Positive
     width: Count
+    edges: Edges
+    keep_ends: bool
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,7 @@ class Network:
     kind: NetworkKind
     hidden: Annotated[int, Range(1, 65536)]
     blocks: Annotated[int, Range(0, 1024)]
+    sees_ends: bool
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,7 @@ class Sample:
     robot_weight: Weight
     obstacle_weight: Weight
     obstacle: Obstacle
+    radius: Annotated[float | None, Range(above=0, high=2)]
 
 
 @dataclass(frozen=True)
@@ -359,5 +366,9 @@ def _check(config: Config) -> None:
         config.correction.smoothing == "covariant" or config.network.kind == "spectral"
     ):
         raise ConfigError("source.kind=gaussian: expected gp or cgp where the source's covariance is asked for")
+    if config.network.sees_ends and config.network.kind == "spectral":
+        raise ConfigError("network.sees_ends=True: expected network.kind=resmlp, spectral takes start and goal from x")
+    if config.correction.keep_ends and config.correction.smoothing == "covariant":
+        raise ConfigError("correction.keep_ends=True: expected correction.smoothing=filter, covariant always does")
     if config.source.fit and config.source.kind == "gaussian":
         raise ConfigError("source.fit=True: expected source.kind gp or cgp, the standard normal has nothing to fit")

@@ -53,10 +53,10 @@ class Solved:
 
 
 @torch.no_grad()
-def guidance(model: ConFlow, setting: Setting, x_0: Tensor) -> Guidance:
-    """Follow a setting's ODE from samples x_0 (batch, T, D) of the source."""
+def guidance(model: ConFlow, setting: Setting, x_0: Tensor, ends: Tensor | None = None) -> Guidance:
+    """Follow a setting's ODE from samples x_0 (batch, T, D) of the source; `ends` as in `ConFlow.field`."""
     steps, solver = model.config.sample.steps, model.config.sample.solver
-    field, v = model.field(setting), model.field("none")
+    field, v = model.field(setting, ends), model.field("none", ends)
     t = torch.arange(steps + 1) / steps
     ratio, robot_barrier, obstacle_barrier = [], [], []
     x = x_0
@@ -78,18 +78,22 @@ def avoided(model: ConFlow, setting: Setting) -> Constraint:
     return model.obstacle if setting == "obstacle" else model.robots
 
 
-def collisions_by_weight(model: ConFlow, setting: Setting, x_0: Tensor, weights: Sequence[float]) -> list[int]:
+def collisions_by_weight(
+    model: ConFlow, setting: Setting, x_0: Tensor, weights: Sequence[float], ends: Tensor | None = None
+) -> list[int]:
     """How many of the trajectories from x_0 (batch, T, D) hit what the setting avoids, at each guidance weight."""
     sample = model.config.sample
     u_c = model.u_c_obstacle if setting == "obstacle" else model.u_c
-    fields = [model.guided(model.v, u_c, weight) for weight in weights]
+    fields = [model.guided(model.field("none", ends), u_c, weight) for weight in weights]
     return [
         int(avoided(model, setting).violation(integrate(field, x_0, sample.steps, sample.solver)).sum())
         for field in fields
     ]
 
 
-def by_evaluations(model: ConFlow, solver: Solver, x_0: Tensor, evaluations: Sequence[int]) -> list[Solved]:
+def by_evaluations(
+    model: ConFlow, solver: Solver, x_0: Tensor, evaluations: Sequence[int], ends: Tensor | None = None
+) -> list[Solved]:
     """Trajectories from x_0 (batch, T, D) without guidance, for each number of network evaluations.
 
     Numbers that are no multiple of what one step of the solver takes are rounded down to one.
@@ -97,6 +101,6 @@ def by_evaluations(model: ConFlow, solver: Solver, x_0: Tensor, evaluations: Seq
     solved = []
     for number in evaluations:
         steps = max(1, number // EVALUATIONS[solver])
-        x = integrate(model.field("none"), x_0, steps, solver)
+        x = integrate(model.field("none", ends), x_0, steps, solver)
         solved.append(Solved(steps * EVALUATIONS[solver], int(model.robots.violation(x).sum()), smoothness(x)))
     return solved

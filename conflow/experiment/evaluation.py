@@ -9,7 +9,7 @@ from torch import Tensor
 
 from conflow.experiment.build import random_stream
 from conflow.experiment.metrics import EnergyDistance, endpoint_error, trajectory_metrics
-from conflow.experiment.module import SETTINGS, ConFlow, Setting
+from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
 from conflow.experiment.progress import ProgressDisplay
 
 LATENCY_BATCH = 256
@@ -67,13 +67,13 @@ def evaluate(model: ConFlow, demonstrations: Tensor, display: ProgressDisplay) -
             evaluation.baseline["data"] |= _mixture_distance(demonstrations[violates], feasible)
     evaluation.baseline["source"] = measure(model, x_0, x_1, reference)
     for done, setting in enumerate(SETTINGS, start=1):
-        x = model.flow(x_0, setting)
+        x = model.flow(x_0, setting, start_and_goal(x_1))
         evaluation.samples[setting] = x.cpu()
         drift = {
             f"{name}_drift": float(endpoint_error(x.cpu(), evaluation.samples["none"], waypoint).mean())
             for name, waypoint in {"start": 0, "end": -1}.items()
         }
-        latency = {"latency_ms": _latency_ms(model, y, setting)}
+        latency = {"latency_ms": _latency_ms(model, x_1, setting)}
         evaluation.results[setting] = measure(model, x, x_1, reference) | drift | latency
         display.update(task, done, f"setting {setting}")
     return evaluation
@@ -106,12 +106,12 @@ def _mixture_distance(negatives: Tensor, feasible: Tensor) -> Metrics:
     return {name: p**2 * value for name, value in metric.compute().items()}
 
 
-def _latency_ms(model: ConFlow, y: Tensor, setting: Setting, repetitions: int = 3) -> float:
+def _latency_ms(model: ConFlow, x_1: Tensor, setting: Setting, repetitions: int = 3) -> float:
     """Median time of sampling one batch of 256, in milliseconds."""
-    y = cycle(y, LATENCY_BATCH)
+    x_1 = cycle(x_1, LATENCY_BATCH)
     times = []
     for _ in range(repetitions):
         start = time.perf_counter()
-        model.sample(y, setting).cpu()  # to the host, so that an accelerator has finished
+        model.sample(x_1, setting).cpu()  # to the host, so that an accelerator has finished
         times.append(1000 * (time.perf_counter() - start))
     return median(times)

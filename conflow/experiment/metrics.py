@@ -5,7 +5,7 @@ States are counts, sums or the values themselves, so batches of any size add up 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -50,8 +50,22 @@ def smoothness(x: Tensor) -> Tensor:
     1 / (T - 2) sum_i |q_{i+1} - 2 q_i + q_{i-1}| for x (batch, T, D) with two coordinates per robot, in
     workspace units per waypoint squared: smaller is smoother.
     """
-    acceleration = x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]
-    return torch.linalg.vector_norm(_positions(acceleration), dim=3).mean(dim=(1, 2))
+    return _acceleration(x).mean(dim=(1, 2))
+
+
+def _acceleration(x: Tensor) -> Tensor:
+    """The norm of the second difference of each robot's positions, (batch, T - 2, robots)."""
+    return torch.linalg.vector_norm(_positions(x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]), dim=3)
+
+
+def peak_acceleration(x: Tensor) -> Tensor:
+    """Another reading of smoothness: as `smoothness`, the largest over waypoints in place of the mean, (batch,)."""
+    return _acceleration(x).mean(dim=2).amax(dim=1)
+
+
+def squared_acceleration(x: Tensor) -> Tensor:
+    """Another reading of smoothness: the mean over waypoints and robots of the squared second difference, (batch,)."""
+    return _acceleration(x).square().mean(dim=(1, 2))
 
 
 def path_length(x: Tensor) -> Tensor:
@@ -185,13 +199,17 @@ class _Values(Metric):
 
 
 class Smoothness(_Values):
-    """Median and 95th percentile of `smoothness`, with the intervals of order statistics."""
+    """Median and 95th percentile of `smoothness`, or of another reading of it, with intervals of order statistics."""
+
+    def __init__(self, name: str = "smoothness", reading: Callable[[Tensor], Tensor] = smoothness) -> None:
+        super().__init__()
+        self.name, self.reading = name, reading
 
     def update(self, x: Tensor) -> None:
-        self.values.append(smoothness(x))
+        self.values.append(self.reading(x))
 
     def compute(self) -> dict[str, float]:
-        return self.quantiles({"smoothness_median": 0.5, "smoothness_p95": 0.95})
+        return self.quantiles({f"{self.name}_median": 0.5, f"{self.name}_p95": 0.95})
 
 
 class PathLength(_Values):
@@ -299,6 +317,9 @@ def trajectory_metrics(robots: Constraint, obstacle: Constraint, reference: Tens
         "success": SuccessRate("success", robots),
         "outside": OutsideRate("outside"),
         "smoothness": Smoothness(),
+        # What the paper calls smoothness it does not say; these are other readings, under their own names.
+        "peak_acceleration": Smoothness("peak_acceleration", peak_acceleration),
+        "squared_acceleration": Smoothness("squared_acceleration", squared_acceleration),
         "path_length": PathLength(),
         "start_error": EndpointError("start_error", 0),
         "end_error": EndpointError("end_error", -1),

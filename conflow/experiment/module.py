@@ -1,5 +1,6 @@
 """ConFlow as a LightningModule: Algorithm 1 of the paper, and sampling from what it trained."""
 
+from functools import partial
 from typing import Any, Literal, get_args
 
 import torch
@@ -13,6 +14,7 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 from conflow.experiment.build import (
     build_source,
     correction,
+    judge,
     network,
     obstacle_avoidance,
     random_stream,
@@ -41,8 +43,8 @@ class ConFlow(LightningModule):
         super().__init__()
         self.config, self.T, self.D = config, T, D
         self.source = build_source(config.source, T)
-        self.robots, self.obstacle = robot_avoidance(config, D), obstacle_avoidance(config, D)
-        self.v = network(config.network, self.source, D, self.robots)
+        self.robots, self.obstacle = judge(config, D), obstacle_avoidance(config, D)
+        self.v = network(config.network, self.source, D, robot_avoidance(config, D))
         margin = config.correction.margin
         self.u_c = correction(config.correction, robot_avoidance(config, D, margin), self.source)
         self.u_c_obstacle = correction(config.correction, obstacle_avoidance(config, D, margin), self.source)
@@ -63,14 +65,15 @@ class ConFlow(LightningModule):
 
     def loss(self, x_1: Tensor, M: Tensor, noise: torch.Generator) -> Tensor:
         """L_CG (Eq. cg_loss) for demonstrations x_1 (batch, T, D) and their violations M (batch,): Algorithm 1."""
-        lambda_c = self.config.correction.lambda_c
+        lambda_c, ends = self.config.correction.lambda_c, start_and_goal(x_1)
+        M = M if self.config.correction.mask == "violates" else ~M
         x_0 = self.source.sample(self.source.observe(x_1), noise)
         t = torch.rand(len(x_1), device=x_1.device, generator=noise)
         if self.config.correction.path == "guided":
             x_t, u_t = guided_path(x_0, x_1, t, self.u_c, lambda_c * M)
-            return F.mse_loss(self.v(x_t, t), u_t)
+            return F.mse_loss(self.v(x_t, t, ends), u_t)
         x_t = interpolate(x_0, x_1, t)
-        v = self.v(x_t, t)
+        v = self.v(x_t, t, ends)
         if self.config.correction.at == "end":
             # The barrier is its own mask: nothing to correct where the predicted end is feasible.
             u_c = t[:, None, None] * self.u_c(end(x_t, v.detach(), t))
@@ -78,26 +81,26 @@ class ConFlow(LightningModule):
             u_c = M[:, None, None] * self.u_c(x_t)
         return F.mse_loss(v, velocity(x_0, x_1) + lambda_c * u_c)
 
-    def field(self, setting: Setting) -> Field:
-        """The velocity field that a setting samples from."""
-        sample = self.config.sample
+    def field(self, setting: Setting, ends: Tensor | None = None) -> Field:
+        """The velocity field of a setting, for starts and goals (batch, 2, D) where the network sees them."""
+        sample, v = self.config.sample, partial(self.v, ends=ends)
         if setting == "robot":
-            return self.guided(self.v, self.u_c, sample.robot_weight)
+            return self.guided(v, self.u_c, sample.robot_weight)
         if setting == "obstacle":
-            return self.guided(self.v, self.u_c_obstacle, sample.obstacle_weight)
-        return self.v
+            return self.guided(v, self.u_c_obstacle, sample.obstacle_weight)
+        return v
 
     def guided(self, v: Field, u_c: Correction, weight: float) -> Field:
         """A field guided by a correction, taken where the training takes it."""
         return (guided_ahead if self.config.correction.at == "end" else guided)(v, u_c, weight)
 
-    def sample(self, y: Tensor, setting: Setting = "none", noise: torch.Generator | None = None) -> Tensor:
-        """Trajectories (batch, T, D), one for each observation y (batch, O, D) of the source (`source.observe`)."""
-        return self.flow(self.source.sample(y, noise), setting)
+    def sample(self, x_1: Tensor, setting: Setting = "none", noise: torch.Generator | None = None) -> Tensor:
+        """Trajectories from where each x_1 starts to where it ends, both (batch, T, D)."""
+        return self.flow(self.source.sample(self.source.observe(x_1), noise), setting, start_and_goal(x_1))
 
-    def flow(self, x_0: Tensor, setting: Setting = "none") -> Tensor:
-        """Where the ODE takes samples x_0 of the source, (batch, T, D)."""
-        return integrate(self.field(setting), x_0, self.config.sample.steps, self.config.sample.solver)
+    def flow(self, x_0: Tensor, setting: Setting = "none", ends: Tensor | None = None) -> Tensor:
+        """Where the ODE of `field` takes samples x_0 of the source, (batch, T, D)."""
+        return integrate(self.field(setting, ends), x_0, self.config.sample.steps, self.config.sample.solver)
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         train = self.config.train
@@ -115,3 +118,8 @@ class ConFlow(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["conflow"] = {"config": self.config.tree(), "T": self.T, "D": self.D}
+
+
+def start_and_goal(x: Tensor) -> Tensor:
+    """The first and the last waypoint of trajectories (batch, T, D), (batch, 2, D)."""
+    return x[:, [0, -1]]

@@ -1,9 +1,11 @@
 """The constraint-induced correction u^c of the velocity (paper: "Constraint-Guided Objective", appendix)."""
 
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor, nn
+
+Edges = Literal["zero", "nearest", "normalised"]
 
 
 class Differentiable(Protocol):
@@ -43,18 +45,23 @@ class Correction(nn.Module):
         return (self.constraint.gradient(x).mT @ self.smoothing.mT).mT
 
 
-def gaussian_filter(T: int, sigma: float = 5.0, width: int = 9) -> Tensor:
+def gaussian_filter(T: int, sigma: float = 5.0, width: int = 9, edges: Edges = "zero") -> Tensor:
     """The Gaussian filter along the trajectory as a matrix, float64 (T, T).
 
     S_ij = w_{i-j} / sum w with w_k = exp(-k^2 / (2 sigma^2)) for |k| <= (width - 1) / 2. Beyond the ends the
-    gradient counts as zero.
+    gradient counts as zero, or as at the nearest end; "normalised" leaves out what is beyond and lets every row sum
+    to 1. The paper does not say which.
     """
-    k = torch.arange(T, dtype=torch.float64)
-    offset = k[:, None] - k
     reach = (width - 1) // 2
-    taps = torch.arange(-reach, reach + 1, dtype=torch.float64)
-    w = torch.exp(-(offset**2) / (2 * sigma**2)) * (offset.abs() <= reach)
-    return w / torch.exp(-(taps**2) / (2 * sigma**2)).sum()
+    k = torch.arange(-reach, reach + 1)
+    w = torch.exp(-(k.double() ** 2) / (2 * sigma**2))
+    j = torch.arange(T)[:, None] + k  # the waypoint under each tap, (T, width)
+    w = (w / w.sum()).repeat(T, 1)
+    if edges != "nearest":
+        w[(j < 0) | (j >= T)] = 0
+    if edges == "normalised":
+        w /= w.sum(dim=1, keepdim=True)
+    return torch.zeros(T, T, dtype=w.dtype).scatter_add(1, j.clamp(0, T - 1), w)
 
 
 def covariant(Sigma: Tensor) -> Tensor:

@@ -25,17 +25,24 @@ class ResMLP(nn.Module):
         T, D: waypoints and dimensions of a trajectory.
         hidden: width; the paper's is 1024.
         blocks: residual blocks; the paper's are 4.
+        sees_ends: whether start and goal are inputs too. The paper does not say.
     """
 
-    def __init__(self, T: int, D: int, hidden: int = 1024, blocks: int = 4) -> None:
+    def __init__(self, T: int, D: int, hidden: int = 1024, blocks: int = 4, sees_ends: bool = False) -> None:
         super().__init__()
-        self.inlet = nn.Linear(T * D + 1, hidden)
+        self.sees_ends = sees_ends
+        self.inlet = nn.Linear((T + 2 * sees_ends) * D + 1, hidden)
         self.blocks = nn.Sequential(*(ResidualBlock(hidden) for _ in range(blocks)))
         self.outlet = nn.Linear(hidden, T * D)
 
-    def forward(self, x: Tensor, t: Tensor) -> Tensor:
-        """The velocity at x (batch, T, D) and t (batch,), (batch, T, D)."""
-        h = self.inlet(torch.cat([x.flatten(1), t[:, None]], dim=1))
+    def forward(self, x: Tensor, t: Tensor, ends: Tensor | None = None) -> Tensor:
+        """The velocity at x (batch, T, D) and t (batch,), for starts and goals (batch, 2, D), (batch, T, D)."""
+        seen = [x.flatten(1), t[:, None]]
+        if self.sees_ends:
+            if ends is None:
+                raise ValueError("ends: expected starts and goals, which this network sees, found none")
+            seen.append(ends.flatten(1))
+        h = self.inlet(torch.cat(seen, dim=1))
         return self.outlet(self.blocks(h)).view_as(x)
 
 
@@ -100,8 +107,8 @@ class SpectralMLP(nn.Module):
         """z = E^T (x - W x_O), (batch, m, D)."""
         return self.modes.mT @ (x - self.mean_map @ x[:, self.observed])
 
-    def forward(self, x: Tensor, t: Tensor) -> Tensor:
-        """The velocity at x (batch, T, D) and t (batch,), (batch, T, D)."""
+    def forward(self, x: Tensor, t: Tensor, ends: Tensor | None = None) -> Tensor:
+        """The velocity at x (batch, T, D) and t (batch,), (batch, T, D); start and goal it takes from x."""
         z, s = self.coordinates(x), t[:, None, None]
         sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
         a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2

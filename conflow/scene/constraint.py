@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from conflow.scene.robots import PointRobots
 
 BarrierShape = Literal["softplus", "relu"]
-Reduction = Literal["waypoint", "closest"]
+Reduction = Literal["sum", "mean", "closest"]
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class Barrier:
     """The barrier as a function of the clearance c = d - r, and where along the trajectory it is taken.
 
     softplus: C_gamma = -1/gamma log(1 + exp(-gamma c)) (Eq. c). relu: C = min(c, 0), its limit for large gamma.
-    Reduction "waypoint" sums C over the waypoints; "closest" takes it at the closest approach alone. The paper
-    leaves open which of the two it means.
+    Reduction "sum" and "mean" are over the waypoints; "closest" takes C at the closest approach alone. The paper
+    leaves open which of them it means.
     """
 
     shape: BarrierShape = "softplus"
-    reduction: Reduction = "waypoint"
+    reduction: Reduction = "sum"
     gamma: float = 10.0
 
     def value(self, c: Tensor) -> Tensor:
@@ -141,13 +141,14 @@ class Avoidance(Constraint):
         return torch.minimum(nearest, torch.minimum(c[:, :-1], c[:, 1:])).amin(dim=2)
 
     def barrier(self, x: Tensor) -> Tensor:
-        return self.shape.value(self._candidates(self._pairs(x)[1]).min(dim=2).values).sum(dim=1)
+        return self._weight(x) * self.shape.value(self._candidates(self._pairs(x)[1]).min(dim=2).values).sum(dim=1)
 
     def gradient(self, x: Tensor) -> Tensor:
         w, c = self._pairs(x)
         candidates = self._candidates(c)
         nearest = candidates.min(dim=2, keepdim=True)
-        dC_dc = torch.zeros_like(candidates).scatter(2, nearest.indices, self.shape.slope(nearest.values)).view_as(c)
+        slope = self._weight(x) * self.shape.slope(nearest.values)
+        dC_dc = torch.zeros_like(candidates).scatter(2, nearest.indices, slope).view_as(c)
         # d|w|/dw = w / |w|; where two bodies share a point there is none, and normalize gives the subgradient 0.
         dC_dw = dC_dc[..., None] * F.normalize(w, dim=3)
         return self.robots.pullback(torch.einsum("pn,btpk->btnk", self.incidence.to(w.dtype), dC_dw))
@@ -158,9 +159,13 @@ class Avoidance(Constraint):
         w = torch.einsum("pn,btnk->btpk", self.incidence.to(x.dtype), p) - self.offset
         return w, torch.linalg.vector_norm(w, dim=3) - self.radius
 
+    def _weight(self, x: Tensor) -> float:
+        """What C at one waypoint counts for in C of the trajectory."""
+        return 1 / x.shape[1] if self.shape.reduction == "mean" else 1
+
     def _candidates(self, c: Tensor) -> Tensor:
         """Clearances arranged so that each row's smallest one counts: (batch, T, pairs) or (batch, 1, T pairs)."""
-        return c if self.shape.reduction == "waypoint" else c.flatten(1)[:, None]
+        return c.flatten(1)[:, None] if self.shape.reduction == "closest" else c
 
 
 class RobotAvoidance(Avoidance):

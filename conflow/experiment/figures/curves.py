@@ -21,7 +21,7 @@ BUDGETS = (2, 4, 8, 16, 32, 64, 128, 256)
 MARK = "#666666"
 
 
-def guidance_weight(model: ConFlow, x_0: Tensor) -> Figure:
+def guidance_weight(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Figure:
     """Collision rates against the guidance weight, up to a hundred times the config's, with Wilson's intervals."""
     sample = model.config.sample
     figure = Figure(figsize=(9, 3.9), layout="constrained")
@@ -32,7 +32,7 @@ def guidance_weight(model: ConFlow, x_0: Tensor) -> Figure:
     for axis, (setting, (configured, name)) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         # A config that does not guide is shown about the weight 1.
         weights = [factor * (configured or 1.0) for factor in FACTORS]
-        counts = collisions_by_weight(model, setting, x_0, weights)
+        counts = collisions_by_weight(model, setting, x_0, weights, ends)
         _rate(axis, weights, counts, len(x_0), COLOURS[setting], name)
         axis.set_xscale("symlog", linthresh=weights[1])
         axis.set_xticks(weights, [f"{weight:g}" for weight in weights])
@@ -43,13 +43,13 @@ def guidance_weight(model: ConFlow, x_0: Tensor) -> Figure:
     return figure
 
 
-def solver_steps(model: ConFlow, x_0: Tensor) -> Figure:
+def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Figure:
     """Collision rate and smoothness without guidance against the network evaluations that the solver spends."""
     sample = model.config.sample
     figure = Figure(figsize=(9, 3.9), layout="constrained")
     rates, smooth = figure.subplots(1, 2)
     for solver, colour in SOLVERS.items():
-        solved = by_evaluations(model, solver, x_0, BUDGETS)
+        solved = by_evaluations(model, solver, x_0, BUDGETS, ends)
         evaluations = [one.evaluations for one in solved]
         _rate(rates, evaluations, [one.collisions for one in solved], len(x_0), colour, solver)
         _median(smooth, solved, colour, solver)

@@ -17,7 +17,7 @@ from conflow.experiment.figures import curves, workspace
 from conflow.experiment.figures.animation import animation
 from conflow.experiment.figures.front import front
 from conflow.experiment.finished import MODEL_FILE, demonstrations, load_model
-from conflow.experiment.module import SETTINGS, ConFlow
+from conflow.experiment.module import SETTINGS, ConFlow, start_and_goal
 
 NUM = 512
 
@@ -58,16 +58,16 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation]:
     folder = _folder() / re.sub(r"[^\w-]+", "_", name)
     console.print(f"{name}: {NUM} trajectories under each setting", highlight=False)
     evaluation = sample(model, data)
-    x_0 = evaluation.source_samples
+    x_0, ends = evaluation.source_samples, start_and_goal(cycle(data.test.x, NUM))
     pictures: dict[str, Callable[[], Figure]] = {
         "demonstrations": lambda: workspace.demonstrations(data),
         "sources": lambda: workspace.sources(model, evaluation),
         "page": lambda: workspace.page(model, data, evaluation),
-        "flow": lambda: workspace.flow(model, x_0),
+        "flow": lambda: workspace.flow(model, x_0, ends),
         "distances": lambda: workspace.distances(model, evaluation),
-        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0) for s in SETTINGS}),
-        "solver_steps": lambda: curves.solver_steps(model, x_0),
-        "guidance_weight": lambda: curves.guidance_weight(model, x_0),
+        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in SETTINGS}),
+        "solver_steps": lambda: curves.solver_steps(model, x_0, ends),
+        "guidance_weight": lambda: curves.guidance_weight(model, x_0, ends),
     }
     for title, picture in pictures.items():
         console.print(f"{name}: {title}.png", highlight=False)
@@ -83,9 +83,9 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation]:
 
 def sample(model: ConFlow, data: DemonstrationData) -> Evaluation:
     """Trajectories under every setting from the same x_0, with starts and goals of test demonstrations."""
-    y = model.source.observe(cycle(data.test.x, NUM))
-    x_0 = model.source.sample(y, random_stream("figures", model.config.seed))
-    return Evaluation(x_0, {setting: model.flow(x_0, setting) for setting in SETTINGS})
+    x_1 = cycle(data.test.x, NUM)
+    x_0 = model.source.sample(model.source.observe(x_1), random_stream("figures", model.config.seed))
+    return Evaluation(x_0, {setting: model.flow(x_0, setting, start_and_goal(x_1)) for setting in SETTINGS})
 
 
 def _log(run: Run, files: Sequence[Path]) -> None:

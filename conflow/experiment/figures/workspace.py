@@ -79,12 +79,12 @@ def methods(runs: Sequence[tuple[str, ConFlow, Evaluation]]) -> Figure:
     return figure
 
 
-def flow(model: ConFlow, x_0: Tensor) -> Figure:
+def flow(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Figure:
     """The ODE without guidance from samples x_0 (batch, T, D) of the source to trajectories, at six times t."""
     steps, solver = model.config.sample.steps, model.config.sample.solver
     figure, axes = _workspaces(2, 3)
     shown = [round(t * steps) for t in TIMES]
-    x = {k: x for k, x in enumerate(states(model.field("none"), x_0, steps, solver)) if k in shown}
+    x = {k: x for k, x in enumerate(states(model.field("none", ends), x_0, steps, solver)) if k in shown}
     for axis, k in zip(axes, shown, strict=True):
         _judged(axis, x[k], model.robots, f"$t = {k / steps:.2g}$")
     _zoom_out(axes, x_0)
