@@ -8,6 +8,7 @@ ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
 JOBS     ?= 1
 RUN      ?= latest
 FORMAT   ?= table
+REFERENCE ?=
 START    ?=
 GOAL     ?=
 # Of these two every command has its own default.
@@ -17,11 +18,13 @@ PORT     ?= 5000
 ARGS     ?=
 
 PYTHON := .venv/bin/python
+# A process for each core, and the tests of a file in the same one: they share what is slow to make.
+PARALLEL := -n auto --dist loadfile
 CONFLOW = $(PYTHON) -m conflow
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
-.PHONY: help train ablations evaluate compare sample figures explain demonstrations ui test lint lock
+.PHONY: help train ablations evaluate compare reference sample figures explain demonstrations ui test test-faults lint lock
 
 help:  ## List what can be made
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -38,8 +41,11 @@ ablations: .venv/installed  ## Train every ablation for every seed, and compare:
 evaluate: .venv/installed  ## Sample a finished run again with other settings: RUN= ARGS="sample.steps=50 seed=1"
 	@$(CONFLOW) evaluate run=$(RUN) $(ARGS)
 
-compare: .venv/installed  ## Print the paper's tables and claims from finished runs: PRESET= FORMAT=table|markdown|csv|json
-	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(ARGS)
+compare: .venv/installed  ## Print the paper's tables and claims: PRESET= FORMAT=table|markdown|csv|json REFERENCE=1 (published runs)
+	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(if $(REFERENCE),reference=1) $(ARGS)
+
+reference: .venv/installed  ## Publish the numbers of finished runs as files in runs/reference/runs/: PRESET=
+	@$(CONFLOW) reference preset=$(PRESET)
 
 sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= SEED= ARGS="obstacle=x,y,r"
 	@$(CONFLOW) sample run=$(RUN) start="$(START)" goal="$(GOAL)" $(WRITTEN) seed=$(SEED) $(ARGS)
@@ -57,7 +63,10 @@ ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
 	@$(CONFLOW) ui port=$(PORT)
 
 test: .venv/installed  ## Run the tests
-	@$(PYTHON) -m pytest -q $(ARGS)
+	@OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q $(PARALLEL) tests --ignore=tests/faults $(ARGS)
+
+test-faults: .venv/installed  ## Run the tests that kill processes, fill disks and break files
+	@OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q $(PARALLEL) tests/faults $(ARGS)
 
 lint: .venv/installed  ## Check style and types
 	@$(PYTHON) -m ruff check conflow tests
@@ -71,10 +80,13 @@ lock:  ## Resolve pyproject.toml anew into requirements.lock
 	@rm -rf .venv/lock
 
 # The environment, made once and again when the lock file changes. A failed installation leaves no stamp.
+# One shell under one lock, so that of several that are started at once one installs and the others wait for it.
 .venv/installed: requirements.lock pyproject.toml
-	@echo "Installing the locked environment into .venv (a few minutes, once)"
-	@python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "conflow: python3 is $$(python3 --version), expected 3.11 or newer" >&2; exit 2; }
-	@test -x $(PYTHON) || python3 -m venv .venv
-	@$(PYTHON) -m pip install -qq --disable-pip-version-check -r requirements.lock
-	@$(PYTHON) -m pip install -qq --disable-pip-version-check --no-deps --editable .
-	@touch $@
+	@exec 9>.venv.lock; ! command -v flock >/dev/null || flock 9; \
+	if [ $@ -nt requirements.lock ] && [ $@ -nt pyproject.toml ]; then exit 0; fi; \
+	echo "Installing the locked environment into .venv (a few minutes, once)"; \
+	python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "conflow: python3 is $$(python3 --version), expected 3.11 or newer" >&2; exit 2; }; \
+	{ test -x $(PYTHON) || python3 -m venv .venv; } \
+	&& $(PYTHON) -m pip install -qq --disable-pip-version-check -r requirements.lock \
+	&& $(PYTHON) -m pip install -qq --disable-pip-version-check --no-deps --editable . \
+	&& touch $@

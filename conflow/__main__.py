@@ -1,25 +1,31 @@
 """The command line: one thin function a command. What a command needs is imported when it runs."""
 
 import argparse
+import os
+import re
 import sys
-from typing import TYPE_CHECKING
+import textwrap
+import traceback
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
 def train(arguments: list[str]) -> None:
-    """Train, sample, evaluate and track one experiment."""
+    """Train, sample, evaluate and track one experiment, or go on with an interrupted one: resume=RUN or latest."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
     # First of all, and with little imported, so that a mistyped setting is answered at once.
-    settings = config.load(arguments)
+    options, rest = config.options(arguments, {"resume": ""})
+    settings = config.load(rest)
+    config.check_training(settings)
 
     from conflow.experiment.train import train
 
     console = _console()
-    run_id = train(settings, console)
+    run_id = train(settings, console, options["resume"])
     console.print(f"Run {run_id} is finished. Look at it with: make ui", highlight=False)
 
 
@@ -31,11 +37,15 @@ def ablations(arguments: list[str]) -> None:
     defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
     options, settings = config.options(arguments, defaults)
     jobs = config.whole(options, "jobs", 1, 1024)
+    for key in ("seeds", "ablations"):
+        if not options[key].split():
+            raise config.ConfigError(f"{key}={options[key]}: expected at least one")
+    wanted = [f"preset={options['preset']}", *settings]
+    config.check_training(config.load(wanted))
 
     from conflow.experiment import compare, grid
 
     console = _console()
-    wanted = [f"preset={options['preset']}", *settings]
     failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console)
     compare.render(compare.collect(options["preset"], settings), "table", console)
     if failed:
@@ -55,13 +65,29 @@ def evaluate(arguments: list[str]) -> None:
 
 
 def compare(arguments: list[str]) -> None:
-    """Print the paper's tables and claims from all finished runs of a preset: preset=quick format=table."""
+    """Print the paper's tables and claims from all finished runs of a preset, or, reference=1, those of record."""
     from conflow.experiment import compare, config
 
-    options, settings = config.options(arguments, {"preset": "quick", "format": "table"})
+    options, settings = config.options(arguments, {"preset": "quick", "format": "table", "reference": "0"})
+    of_record = bool(config.whole(options, "reference", 0, 1))
+    config.load([f"preset={options['preset']}", *settings])  # of a mistyped one there are no runs either
 
     form = compare.checked_format(options["format"])
-    compare.render(compare.collect(options["preset"], settings), form, _console())
+    found = compare.collect_reference() if of_record else compare.collect(options["preset"], settings)
+    compare.render(found, form, _console())
+
+
+def reference(arguments: list[str]) -> None:
+    """Write the numbers of all finished runs of a preset into runs/reference/runs/, a file each: preset=quick."""
+    from conflow.experiment import config
+
+    options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
+    config.load([f"preset={options['preset']}"])
+
+    from conflow.experiment import record
+
+    paths = record.publish(options["preset"])
+    print(f"Written: {len(paths)} files in {record.FOLDER}")
 
 
 def sample(arguments: list[str]) -> None:
@@ -103,8 +129,10 @@ def explain(arguments: list[str]) -> None:
     options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
     settings = config.load([f"preset={options['preset']}"])
 
+    from conflow.experiment import tracking
     from conflow.experiment.figures import explain, gallery
 
+    tracking.client()  # what is wrong with the store is said before anything is drawn
     console = _console()
     explain.draw(settings, console)
     gallery.draw_front(settings, console)
@@ -141,6 +169,7 @@ COMMANDS = {
     "ablations": ablations,
     "evaluate": evaluate,
     "compare": compare,
+    "reference": reference,
     "sample": sample,
     "figures": figures,
     "explain": explain,
@@ -149,9 +178,16 @@ COMMANDS = {
 }
 
 
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, _line(f"{message}; try: {self.prog} --help") + "\n")
+
+
 def main() -> None:
     """Run one command; exit with 0, with 2 and one line for a known failure, or with 128 + a signal."""
-    parser = argparse.ArgumentParser("conflow", description="Constraint-guided flow matching for robot motion.")
+    parser = Parser("conflow", description="Constraint-guided flow matching for robot motion.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, function in COMMANDS.items():
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
@@ -159,6 +195,7 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         COMMANDS[arguments.command](arguments.settings)
+        sys.stdout.flush()  # what the output says to this is said here, not after the end
     except BaseException as error:
         sys.exit(_exit_code(error))
 
@@ -173,17 +210,59 @@ def _console() -> "Console":
 
 def _exit_code(error: BaseException) -> int:
     """Known failures end in one line on stderr and an exit code; anything else is a bug and raised."""
-    from conflow.experiment.config import ConfigError
     from conflow.experiment.signals import Interrupted
-    from conflow.scene.trajectories import DemonstrationError
 
-    if isinstance(error, ConfigError | DemonstrationError):
-        print(f"conflow: {error}", file=sys.stderr)
-        return 2
     if isinstance(error, Interrupted):
         print(f"conflow: interrupted by {error}", file=sys.stderr)
         return error.exit_code
-    raise error
+    reason = _reason(error)
+    if reason is None:
+        raise error
+    print(_line(reason), file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except OSError:  # nor will it take at the end what it did not take now
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 2
+
+
+def _reason(error: BaseException) -> str | None:
+    """What a known failure says; None of any other."""
+    from conflow.experiment.config import ConfigError
+    from conflow.scene.trajectories import DemonstrationError
+
+    if isinstance(error, ConfigError | DemonstrationError):
+        return str(error)
+    text = textwrap.shorten(str(error), 200, placeholder=" ...")
+    if isinstance(error, MemoryError) or re.search("can't allocate memory|out of memory", text):  # says torch
+        return f"memory: {text or 'used up'}, expected a smaller network, batch, or number of trajectories"
+    if _of_store(error):
+        uri = os.environ.get("MLFLOW_TRACKING_URI")
+        store = f"MLFLOW_TRACKING_URI={uri}" if uri else "runs/mlflow.db"
+        found = textwrap.shorten(str(error).partition("[SQL")[0], 200, placeholder=" ...")
+        # Without the password.
+        return re.sub(r"(?<=//)[^/@\s]+@", "", f"{store}: {found}, expected a store that MLflow can use")
+    if isinstance(error, OSError) and error.strerror:
+        where = "output" if error.filename is None else error.filename
+        return f"{where}: {error.strerror}, expected a file or folder that can be used"
+    return None
+
+
+def _of_store(error: BaseException) -> bool:
+    """Whether MLflow or its database failed, which are not imported here: most commands end before they are."""
+    libraries = ("mlflow", "sqlalchemy")
+    if type(error).__module__.partition(".")[0] in libraries:
+        return True
+    frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    # A folder that cannot be made, or a database's driver that is not installed.
+    through = any(name.partition(".")[0] in libraries for name in frames)
+    return isinstance(error, OSError | ModuleNotFoundError) and through
+
+
+def _line(reason: str) -> str:
+    """One line for the terminal, in which nothing acts on it."""
+    shown = (c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(reason.split()))
+    return f"conflow: {''.join(shown)}"
 
 
 if __name__ == "__main__":

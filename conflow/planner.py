@@ -4,7 +4,7 @@
 >>> best, clearance = plans.x[0], plans.clearance[0]
 """
 
-import math
+import tempfile
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
@@ -19,11 +19,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from mlflow.exceptions import MlflowException
 from numpy.typing import ArrayLike
+from sqlalchemy.exc import SQLAlchemyError
 from torch import Tensor
 
 from conflow.experiment import config
 from conflow.experiment.build import obstacle_avoidance, random_stream
-from conflow.experiment.config import ConfigError, nearest
+from conflow.experiment.config import ConfigError, Range, brief, check_memory, nearest
 from conflow.experiment.figures.workspace import COLLISION, OBSTACLE, ROBOTS
 from conflow.experiment.finished import MODEL_FILE, load_model
 from conflow.experiment.metrics import smoothness, wilson
@@ -81,7 +82,8 @@ class Planner:
         Only weights and plain values are read; no code in the file is executed.
 
         Raises:
-            PlanError: there is no such run or file, or the file is damaged or no run's `model.ckpt`.
+            PlanError: there is no such run or file, the store cannot be used, or the file is damaged or no run's
+                `model.ckpt`.
         """
         path = _checkpoint(run)
         try:
@@ -148,11 +150,20 @@ class Planner:
 
         y = torch.stack([start, *(point.expand_as(start) for point in points.values()), goal], dim=-2)
         y = y.reshape(-1, *y.shape[-2:])
+        self._check_memory(num, len(y))
         ends = start_and_goal(y).repeat_interleave(num, dim=0)
         v = self._field(ends, guidance, discs, robot_weight, obstacle_weight)
         x = self._sample(v, y, (0, *points, -1), num, seed)
         plans = _ranked(x, constraint)
         return plans if start.ndim == 2 else plans[0]
+
+    def _check_memory(self, num: int, pairs: int) -> None:
+        """Refuse more plans than fit into memory: x_0, x_t, v and the step of each, and two layers of the network."""
+        floats = 4 * self.model.T * self.model.D + 2 * self.model.config.network.hidden
+        try:
+            check_memory("num", num, 4 * num * pairs * floats)
+        except ConfigError as error:
+            raise PlanError(str(error)) from None
 
     def _field(
         self,
@@ -165,7 +176,7 @@ class Planner:
         """The network's velocity field inside those of the guidance."""
         if guidance is not None and guidance not in get_args(Guidance):
             offer = nearest(str(guidance), get_args(Guidance))
-            raise PlanError(f"guidance={_brief(guidance)}: expected one of {', '.join(get_args(Guidance))}{offer}")
+            raise PlanError(f"guidance={brief(guidance)}: expected one of {', '.join(get_args(Guidance))}{offer}")
         if guidance == "obstacle" and not obstacles:
             raise PlanError("guidance=obstacle: expected obstacles to guide around, found none")
         sample = self.model.config.sample
@@ -189,7 +200,10 @@ class Planner:
 
     def _sample(self, v: Field, y: Tensor, index: Sequence[int], num: int, seed: int) -> Tensor:
         """`num` trajectories for each row of y (B, O, D), which they meet at the waypoints `index`: (B, num, T, D)."""
-        source = self.model.source.condition(index)
+        try:
+            source = self.model.source.condition(index)
+        except ValueError as error:
+            raise PlanError(f"via: {error}") from None
         # Each pair's own draws, so that they do not depend on the other pairs.
         x_0 = torch.cat([source.sample(pair.expand(num, -1, -1), random_stream("plan", seed)) for pair in y])
         x_1 = integrate(v, x_0, self.model.config.sample.steps, self.model.config.sample.solver)
@@ -223,14 +237,18 @@ def _ranked(x: Tensor, constraint: Constraint) -> Plans:
 
 def _checkpoint(run: str | Path) -> Path:
     """Where the checkpoint of a run is; a text with a slash or the ending .ckpt is a path."""
+    if not isinstance(run, str | Path):
+        raise PlanError(f"run={brief(run)}: expected a run's id or name, latest, or the path of a {MODEL_FILE}")
     if isinstance(run, Path) or "/" in run or run.endswith(".ckpt"):
         return Path(run)
     try:
         return artifact(find_run(run), MODEL_FILE)
     except ConfigError as error:
         raise PlanError(str(error)) from None
-    except (MlflowException, OSError):
-        raise PlanError(f"run={run}: expected a run in the store with a {MODEL_FILE}, which cannot be had") from None
+    except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:  # of a database's driver
+        raise PlanError(
+            f"run={run}: expected a run in the store with a {MODEL_FILE}, which cannot be had: {brief(error)}"
+        ) from None
 
 
 def _numbers(name: str, value: Numbers, expected: str) -> Tensor:
@@ -238,9 +256,9 @@ def _numbers(name: str, value: Numbers, expected: str) -> Tensor:
     try:
         numbers = value.detach().cpu() if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
     except (TypeError, ValueError, RuntimeError):
-        raise PlanError(f"{name}={_brief(value)}: expected {expected}") from None
+        raise PlanError(f"{name}={brief(value)}: expected {expected}") from None
     if numbers.dtype == torch.bool or numbers.is_complex():
-        raise PlanError(f"{name}={_brief(value)}: found {numbers.dtype}, expected {expected}")
+        raise PlanError(f"{name}={brief(value)}: found {numbers.dtype}, expected {expected}")
     return numbers.float()
 
 
@@ -249,7 +267,7 @@ def _positions(name: str, value: Numbers, D: int, batch: bool = True) -> Tensor:
     expected = f"numbers of shape ({D},)" + f" or (B, {D})" * batch
     y = _numbers(name, value, expected)
     if y.ndim not in (1, 1 + batch) or y.shape[-1] != D or not len(y):
-        raise PlanError(f"{name}={_brief(value)}: found shape {tuple(y.shape)}, expected {expected}")
+        raise PlanError(f"{name}={brief(value)}: found shape {tuple(y.shape)}, expected {expected}")
     # Not a number is not inside either.
     _refuse(name, y, ~(y.abs() <= 1).all(dim=-1), "expected finite numbers in the workspace [-1, 1]")
     return y
@@ -279,9 +297,9 @@ def _via_points(via: Sequence[ViaPoint], T: int, D: int) -> dict[int, Tensor]:
         try:
             s, position = point
         except (TypeError, ValueError):
-            raise PlanError(f"via[{i}]={_brief(point)}: expected (s, position)") from None
+            raise PlanError(f"via[{i}]={brief(point)}: expected (s, position)") from None
         if not _is_real(s) or not 0 < s < 1:
-            raise PlanError(f"via[{i}]: s={_brief(s)}, expected a number above 0 and below 1")
+            raise PlanError(f"via[{i}]: s={brief(s)}, expected a number above 0 and below 1")
         waypoint = min(max(round(s * (T - 1)), 1), T - 2)
         if waypoint in points:
             raise PlanError(
@@ -296,7 +314,7 @@ def _obstacle(name: str, value: Obstacle | Sequence[float]) -> Obstacle:
     expected = "an Obstacle or (x, y, radius)"
     triple = _numbers(name, astuple(value) if isinstance(value, Obstacle) else value, expected)
     if triple.shape != (3,):
-        raise PlanError(f"{name}={_brief(value)}: found shape {tuple(triple.shape)}, expected {expected}")
+        raise PlanError(f"{name}={brief(value)}: found shape {tuple(triple.shape)}, expected {expected}")
     if not bool(triple.isfinite().all()) or not triple[2] > 0:
         raise PlanError(f"{name}={_text(triple.tolist())}: expected finite numbers and a radius above 0")
     return value if isinstance(value, Obstacle) else Obstacle(*(float(number) for number in value))
@@ -306,31 +324,26 @@ def _items(name: str, value: Iterable[Any]) -> list[Any]:
     try:
         return list(value)
     except TypeError:
-        raise PlanError(f"{name}={_brief(value)}: expected a sequence") from None
+        raise PlanError(f"{name}={brief(value)}: expected a sequence") from None
 
 
 def _whole(name: str, value: Any, low: int) -> int:
     if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
-        raise PlanError(f"{name}={_brief(value)}: expected a whole number of at least {low}")
+        raise PlanError(f"{name}={brief(value)}: expected a whole number of at least {low}")
     return int(value)
 
 
 def _weight(name: str, value: Any, default: float) -> float:
     if value is None:
         return default
-    if not _is_real(value) or not math.isfinite(value) or value < 0:
-        raise PlanError(f"{name}={_brief(value)}: expected a finite number of at least 0")
+    allowed = Range(0, 1e9)
+    if not _is_real(value) or value not in allowed:
+        raise PlanError(f"{name}={brief(value)}: expected a finite number {allowed}")
     return float(value)
 
 
 def _is_real(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _brief(value: object) -> str:
-    """A value in one line of bearable length."""
-    text = " ".join(str(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _text(numbers: Iterable[float]) -> str:
@@ -398,11 +411,14 @@ def _new_files(out: str) -> Path:
     path = Path(out)
     if path.suffix != ".npz":
         raise PlanError(f"out={out}: expected a name that ends in .npz")
-    if not path.parent.is_dir():
-        raise PlanError(f"out={out}: expected an existing folder, found no {path.parent}")
-    for file in (path, path.with_suffix(".png")):
-        if file.exists():
-            raise PlanError(f"out={out}: expected a new file, found that {file} exists already")
+    try:
+        if not path.parent.is_dir():
+            raise PlanError(f"out={out}: expected an existing folder, found no {path.parent}")
+        for file in (path, path.with_suffix(".png")):
+            if file.exists():
+                raise PlanError(f"out={out}: expected a new file, found that {file} exists already")
+    except OSError as error:
+        raise _unwritable(path, error) from None
     return path
 
 
@@ -410,11 +426,21 @@ def _save(
     path: Path, plans: Plans, start: Sequence[float], goal: Sequence[float], obstacles: Sequence[Obstacle]
 ) -> None:
     arrays = {field.name: getattr(plans, field.name).numpy() for field in fields(plans)}
+    written: list[Path] = []
     try:
-        # Mode x refuses a file that has appeared in the meantime.
-        with path.open("xb") as file:
-            np.savez(file, **arrays, start=np.array(start, np.float32), goal=np.array(goal, np.float32))
-        with path.with_suffix(".png").open("xb") as file:
-            picture(plans, obstacles).savefig(file, format="png", dpi=110)
+        with tempfile.TemporaryDirectory(prefix=".conflow-", dir=path.parent) as folder:
+            files = (path, path.with_suffix(".png"))
+            plain, drawn = (Path(folder, file.name) for file in files)
+            np.savez(plain, **arrays, start=np.array(start, np.float32), goal=np.array(goal, np.float32))
+            picture(plans, obstacles).savefig(drawn, format="png", dpi=110)
+            for file, part in zip(files, (plain, drawn), strict=True):
+                file.hardlink_to(part)  # which refuses to replace a file that has appeared in the meantime
+                written.append(file)
     except OSError as error:
-        raise PlanError(f"out={path}: {error.strerror}, expected a new file that can be written") from None
+        for file in written:
+            file.unlink()
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> PlanError:
+    return PlanError(f"out={path}: {error.strerror}, expected a new file that can be written")

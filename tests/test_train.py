@@ -1,8 +1,3 @@
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -115,48 +110,6 @@ def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Ru
         for key, value in metrics.compute().items():
             # To the bit but for the order of sums: training and test may run on other numbers of threads.
             assert run.data.metrics[f"test/{setting}/{key}"] == pytest.approx(value, rel=1e-5)
-
-
-def test_a_failure_in_training_marks_the_run_failed(conflow: Command, workplace: Path) -> None:
-    folder = workplace / "runs" / "checkpoints"
-    if folder.exists():
-        folder.rename(workplace / "runs" / "kept")
-    folder.write_text("in the way of the checkpoints")
-    try:
-        result = conflow("train", "preset=smoke", "seed=4")
-    finally:
-        folder.unlink()
-        if (workplace / "runs" / "kept").exists():
-            (workplace / "runs" / "kept").rename(folder)
-    assert result.returncode != 0
-    assert (runs(workplace)[0].info.run_name, runs(workplace)[0].info.status) == ("cgp-s4", "FAILED")
-
-
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_run_is_killed_and_keeps_what_was_logged(
-    signum: signal.Signals, workplace: Path, trained: tuple[Run, str]
-) -> None:
-    name = f"cgp-s{50 + signum}"
-    arguments = ["train", "preset=smoke", f"seed={50 + signum}", "train.max_steps=1000000", "train.val_every=1000000"]
-    command = [sys.executable, "-m", "conflow", *arguments]
-    environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
-    process = subprocess.Popen(
-        command, cwd=workplace, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        if (workplace / "runs" / "mlflow.db").exists():
-            named = [run for run in runs(workplace) if run.info.run_name == name]
-            if named and "train/loss" in named[0].data.metrics:
-                break
-        time.sleep(0.5)
-    process.send_signal(signum)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 128 + signum
-    assert stderr.decode().splitlines()[-1] == f"conflow: interrupted by {signum.name}"
-    (run,) = [run for run in runs(workplace) if run.info.run_name == name]
-    assert run.info.status == "KILLED"
-    assert run.data.metrics["train/loss"] > 0
 
 
 @pytest.mark.parametrize(

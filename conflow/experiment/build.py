@@ -28,11 +28,18 @@ def build_source(settings: config.Source, T: int) -> Source:
 
 
 def fitted(settings: Config, demonstrations: Tensor) -> Config:
-    """The settings with the kernel most likely for demonstrations (N, T, D), where `source.fit` asks for it."""
+    """The settings with the kernel most likely for demonstrations (N, T, D), where `source.fit` asks for it.
+
+    Raises:
+        ConfigError: there is none.
+    """
     if not settings.source.fit:
         return settings
     index = CONDITIONED[settings.source.kind]
-    length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.source.epsilon)
+    try:
+        length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.source.epsilon)
+    except ValueError as error:
+        raise config.ConfigError(f"source.fit=True: {error}") from None
     return replace(settings, source=replace(settings.source, length_scale=length_scale, sigma_f=sigma_f))
 
 

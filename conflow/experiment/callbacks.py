@@ -9,7 +9,7 @@ from rich.progress import TaskID
 
 from conflow.experiment.build import random_stream
 from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.evaluation import Evaluation, cycle, evaluate
+from conflow.experiment.evaluation import cycle
 from conflow.experiment.metrics import CollisionRate
 from conflow.experiment.module import ConFlow
 from conflow.experiment.progress import ProgressDisplay
@@ -20,31 +20,41 @@ VALIDATION_SAMPLES = 256
 class TrainingLog(Callback):
     """train/loss, train/grad_norm and train/steps_per_second, every `log_every` steps.
 
-    Between two points nothing is read from the device, so the loop never waits for a number.
+    Between two points nothing is read from the device, so the loop never waits for a number. What has been summed up
+    since the last one is part of a checkpoint.
     """
 
     def __init__(self, log_every: int) -> None:
         self.log_every = log_every
-        self.since, self.loss = (0, 0.0), torch.zeros(())
+        self.summed, self.loss = 0, torch.zeros(())
+        self.since = 0, 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"summed": self.summed, "loss": self.loss}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.summed, self.loss = state_dict["summed"], state_dict["loss"]
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         self.since = trainer.global_step, time.monotonic()
-        self.loss = torch.zeros((), device=pl_module.device)
+        self.loss = self.loss.to(pl_module.device)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         self.loss += outputs["loss"]
+        self.summed += 1
         step, (last, then) = trainer.global_step, self.since
         if (step % self.log_every and step != trainer.max_steps) or trainer.logger is None:
             return
+        pl_module.check_finite("the loss", self.loss, batch_idx)
         now = time.monotonic()
         metrics = {
-            "train/loss": float(self.loss) / (step - last),
+            "train/loss": float(self.loss) / self.summed,
             "train/grad_norm": float(pl_module.grad_norm),
             "train/steps_per_second": (step - last) / (now - then),
         }
         trainer.logger.log_metrics(metrics, step)
         self.loss.zero_()
-        self.since = step, now
+        self.summed, self.since = 0, (step, now)
 
 
 class TrainingProgress(Callback):
@@ -65,17 +75,11 @@ class TrainingProgress(Callback):
             self.display.update(self.task, trainer.global_step, f"loss {float(outputs['loss']):.4f}")
 
 
-class Evaluate(Callback):
-    """Evaluates on the test demonstrations when training ends, and takes a small sample at every validation.
+class ValidationSamples(Callback):
+    """Takes a small sample at every validation: val/none/robot_collision_rate beside val/loss."""
 
-    Attributes:
-        done: the evaluation, there when training has ended.
-    """
-
-    done: Evaluation
-
-    def __init__(self, data: DemonstrationData, display: ProgressDisplay) -> None:
-        self.data, self.display = data, display
+    def __init__(self, data: DemonstrationData) -> None:
+        self.data = data
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
         if trainer.logger is None:
@@ -89,9 +93,3 @@ class Evaluate(Callback):
         # val/loss goes along: Lightning would log it at the step before.
         metrics["val/loss"] = float(trainer.callback_metrics["val/loss"])
         trainer.logger.log_metrics(metrics, trainer.global_step)
-
-    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
-        self.done = evaluate(pl_module.eval(), self.data.test.x, self.display)
-        if trainer.logger is not None:
-            # One value a run: at step 0 MLflow draws bars that compare runs, at any other a line of one point.
-            trainer.logger.log_metrics(self.done.keyed(), 0)

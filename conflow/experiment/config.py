@@ -5,13 +5,17 @@ OmegaConf stays inside this file. What leaves it is a frozen `Config`; every def
 
 import dataclasses
 import difflib
+import functools
 import hashlib
 import math
+import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
 
+import torch
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -32,8 +36,15 @@ PathKind = Literal["linear", "guided"]
 Tree = dict[str, Any]
 
 
+MOST_NUMBERS = 64
+"""The longest list that a setting may be: OmegaConf takes its time over each number."""
+
+
 class ConfigError(ValueError):
     """A setting that cannot be used: its name, its value and what was expected, in one line."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(" ".join(reason.split()))
 
 
 @dataclass(frozen=True)
@@ -45,15 +56,18 @@ class Range:
     above: float = -math.inf
 
     def __contains__(self, value: float) -> bool:
-        return math.isfinite(value) and self.low <= value <= self.high and value > self.above
+        # Compared, not converted: a whole number may be too large for a float.
+        return self.low <= value <= self.high and value > self.above and abs(value) < math.inf
 
     def __str__(self) -> str:
         bounds = {"above": self.above, "of at least": self.low, "at most": self.high}
         return " and ".join(f"{word} {bound:.16g}" for word, bound in bounds.items() if math.isfinite(bound))
 
 
-Positive = Annotated[float, Range(above=0)]
-Weight = Annotated[float, Range(0)]
+Positive = Annotated[float, Range(above=0, high=1e9)]
+Weight = Annotated[float, Range(0, 1e9)]
+# Their squares and inverses must stay numbers, also in single precision.
+Scale = Annotated[float, Range(1e-6, 1e6)]
 Count = Annotated[int, Range(1, 10**9)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Fraction = Annotated[float, Range(above=0, high=1)]
@@ -77,9 +91,9 @@ class Data:
 @dataclass(frozen=True)
 class Source:
     kind: SourceKind
-    length_scale: Positive
-    sigma_f: Positive
-    epsilon: Positive
+    length_scale: Scale
+    sigma_f: Scale
+    epsilon: Annotated[float, Range(1e-12, 1e6)]
     modes: Annotated[int | None, Range(1, 4096)]
     fit: bool
 
@@ -88,7 +102,7 @@ class Source:
 class Constraint:
     radius: Annotated[float, Range(above=0, high=2)]
     barrier: BarrierShape
-    gamma: Positive
+    gamma: Scale
     reduction: Reduction
 
 
@@ -100,8 +114,8 @@ class Correction:
     path: PathKind
     margin: Annotated[float, Range(0, 1)]
     smoothing: Smoothing
-    sigma: Positive
-    width: Count
+    sigma: Scale
+    width: Annotated[int, Range(1, 8191)]
     edges: Edges
     keep_ends: bool
 
@@ -127,13 +141,21 @@ class Train:
 
 @dataclass(frozen=True)
 class Sample:
-    num: Annotated[int, Range(2)]
+    num: Annotated[int, Range(2, 10**9)]
     solver: Solver
     steps: Count
     robot_weight: Weight
     obstacle_weight: Weight
     obstacle: Obstacle
     radius: Annotated[float | None, Range(above=0, high=2)]
+
+
+# Of settings whose dataclass stands in scene/.
+RANGES = {
+    "sample.obstacle.x": Range(-2, 2),
+    "sample.obstacle.y": Range(-2, 2),
+    "sample.obstacle.radius": Range(above=0, high=2),
+}
 
 
 @dataclass(frozen=True)
@@ -177,7 +199,8 @@ def load(arguments: Sequence[str] = ()) -> Config:
     layers = [base]
     for axis, name in chosen.items():
         if name not in names(axis):
-            raise ConfigError(f"{axis}={name}: expected one of {', '.join(names(axis))}{nearest(name, names(axis))}")
+            offer = nearest(name, names(axis))
+            raise ConfigError(f"{axis}={brief(name)}: expected one of {', '.join(names(axis))}{offer}")
         layers.append(_read(f"{axis}/{name}"))
     settings = _schema(Config)
     for key, value in [leaf for layer in layers for leaf in flatten(layer).items()] + pairs:
@@ -215,7 +238,8 @@ def override(config: Config, arguments: Sequence[str], allowed: Sequence[str]) -
     for key, value in map(split, arguments):
         _set(settings, key, value)
         if not key.startswith(tuple(allowed)):
-            raise ConfigError(f"{key}={value}: fixed by the run, expected settings of {' and '.join(allowed)} only")
+            expected = f"expected settings of {' and '.join(allowed)} only"
+            raise ConfigError(f"{key}={brief(value)}: fixed by the run, {expected}")
     return from_tree(OmegaConf.to_container(settings))
 
 
@@ -234,7 +258,13 @@ def _fields(cls: type = Config, prefix: str = "") -> Iterator[tuple[str, Any, Ra
         if dataclasses.is_dataclass(kind):
             yield from _fields(cast(type, kind), f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}", kind, allowed
+            yield f"{prefix}{name}", kind, RANGES.get(f"{prefix}{name}", allowed)
+
+
+@functools.cache
+def _types() -> dict[str, Any]:
+    """Every setting's type by its dotted key."""
+    return {name: kind for name, kind, _ in _fields()}
 
 
 def _schema(cls: type) -> Any:
@@ -271,7 +301,8 @@ def options(arguments: Sequence[str], defaults: Mapping[str, str], settings: boo
         elif settings:
             rest.append(argument)
         else:
-            raise ConfigError(f"{key}: no such option, expected {', '.join(chosen)}{nearest(key, list(chosen))}")
+            offer = nearest(key, list(chosen))
+            raise ConfigError(f"{brief(key)}: no such option, expected {', '.join(chosen)}{offer}")
     return chosen, rest
 
 
@@ -281,16 +312,18 @@ def whole(options: Mapping[str, str], key: str, low: int, high: int) -> int:
     Raises:
         ConfigError: it is not.
     """
-    if not options[key].isdecimal() or not low <= int(options[key]) <= high:
-        raise ConfigError(f"{key}={options[key]}: expected a whole number of at least {low} and at most {high}")
-    return int(options[key])
+    text = options[key]
+    # Longer numbers than Python converts are too large anyway.
+    if not text.isdecimal() or len(text) > 99 or not low <= int(text) <= high:
+        raise ConfigError(f"{key}={brief(text)}: expected a whole number of at least {low} and at most {high}")
+    return int(text)
 
 
 def split(argument: str) -> tuple[str, str]:
     """Key and value of an argument `key=value`."""
     key, equals, value = argument.partition("=")
     if not equals:
-        raise ConfigError(f"{argument}: expected key=value")
+        raise ConfigError(f"{brief(argument)}: expected key=value")
     return key.strip(), value.strip()
 
 
@@ -300,16 +333,75 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+def brief(value: object) -> str:
+    """A value in one line of bearable length, as a message shows it."""
+    try:
+        text = " ".join(str(value).split())
+    except ValueError:  # Python refuses to write out a number of more than 4,300 digits
+        return "a huge number"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def memory() -> int:
+    """The bytes of memory that this machine has, or that its control group leaves to this process."""
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(machine, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # there is no such group, or it says max
+        return machine
+
+
+def check_memory(key: str, value: int, needed: int) -> None:
+    """Refuse a setting before it takes memory that this machine does not have.
+
+    Args:
+        key: the setting.
+        value: what it is set to.
+        needed: bytes that it surely takes.
+
+    Raises:
+        ConfigError: it would take more than the machine has.
+    """
+    if needed > memory():
+        raise ConfigError(
+            f"{key}={brief(value)}: takes {brief(-(-needed // 2**30))} GiB of memory or more, "
+            f"expected what fits into the {memory() // 2**30} GiB that this machine has"
+        )
+
+
+def check_training(config: Config) -> None:
+    """Refuse a network and a batch that cannot be trained in this machine's memory, before anything is made.
+
+    Where demonstrations are read from a file, T and D are not known yet, and the smallest are assumed.
+
+    Raises:
+        ConfigError: names the setting, the memory that it would take and that of the machine.
+    """
+    network, batch = config.network, config.train.batch_size
+    size = 4 * config.data.horizon if config.data.path is None else 12
+    weights = 2 * network.blocks * network.hidden**2
+    if network.kind == "resmlp":
+        weights += 2 * size * network.hidden
+    # In single precision, each weight with its gradient and Adam's two moments.
+    check_memory(f"network.blocks={network.blocks}, network.hidden", network.hidden, 16 * weights)
+    # x_0, x_1, x_t, u_t and v; and what the backward pass needs of each block.
+    floats = 5 * size + 4 * network.blocks * network.hidden
+    if not torch.cuda.is_available():  # whose memory is another
+        check_memory("train.batch_size", batch, 4 * batch * floats)
+
+
 def _set(settings: Any, key: str, value: Any) -> None:
     """Set one key to a value, or to the value that an argument's text means for a setting of its type."""
-    types = {name: kind for name, kind, _ in _fields()}
+    types = _types()
     if key not in types:
-        raise ConfigError(f"{key}: no such setting{nearest(key, list(types))}")
+        raise ConfigError(f"{brief(key)}: no such setting, expected one of conf/base.yaml{nearest(key, list(types))}")
     try:
         parsed = _parse(value, types[key]) if isinstance(value, str) else value
+        if _refers(parsed):
+            raise ValueError
         OmegaConf.update(settings, key, parsed, merge=False)
-    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OverflowError):
-        raise ConfigError(f"{key}={value}: expected {_describe(types[key])}") from None
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OverflowError, RecursionError):
+        raise ConfigError(f"{key}={brief(value)}: expected {_describe(types[key])}") from None
 
 
 def _parse(text: str, kind: Any) -> Any:
@@ -318,7 +410,23 @@ def _parse(text: str, kind: Any) -> Any:
         return text
     if kind == str | None:
         return None if text in ("", "null") else text
-    return yaml.safe_load(text)
+    if kind == list[float]:
+        numbers = yaml.safe_load(text)
+        if isinstance(numbers, list) and len(numbers) > MOST_NUMBERS:
+            raise ValueError
+        return numbers
+    # YAML has more to say than a number: anchors, tags, comments.
+    if not re.fullmatch(r"[\w.+-]*", text):
+        raise ValueError
+    value = yaml.safe_load(text)
+    if kind is bool and not isinstance(value, bool):  # OmegaConf takes any number for one
+        raise ValueError
+    return value
+
+
+def _refers(value: Any) -> bool:
+    """Whether OmegaConf would take a value for a reference to another, or to the environment, or for none."""
+    return "${" in str(value) or value == "???"
 
 
 def _describe(kind: Any) -> str:
@@ -329,11 +437,11 @@ def _describe(kind: Any) -> str:
         float: "a finite number",
         bool: "true or false",
         str: "a name",
-        list[float]: "[a, b, ...]",
+        list[float]: f"[a, b, ...] of at most {MOST_NUMBERS} numbers",
         int | None: "a whole number or null",
         float | None: "a finite number or null",
     }
-    return words.get(kind, "a text or null")
+    return words.get(kind, "a text without ${, or null")
 
 
 def _check(config: Config) -> None:
@@ -341,7 +449,7 @@ def _check(config: Config) -> None:
     for key, kind, allowed in _fields():
         for value in values[key] if isinstance(values[key], list) else [values[key]]:
             if isinstance(value, int | float) and value not in allowed:
-                raise ConfigError(f"{key}={values[key]}: expected {_describe(kind)} {allowed}")
+                raise ConfigError(f"{key}={brief(values[key])}: expected {_describe(kind)} {allowed}")
     if not config.data.amplitudes:
         raise ConfigError("data.amplitudes=[]: expected at least one amplitude")
     if config.correction.width % 2 == 0:

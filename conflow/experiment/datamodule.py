@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
 from conflow.experiment.build import random_stream, repaired, robot_avoidance
-from conflow.experiment.config import Config
+from conflow.experiment.config import Config, check_memory
 from conflow.scene import trajectories
 from conflow.scene.trajectories import DemonstrationError
 
@@ -79,6 +79,7 @@ class DemonstrationData(LightningDataModule):
 
     Raises:
         DemonstrationError: the demonstrations cannot be used, or a class that the ablation needs is missing.
+        ConfigError: so many demonstrations or samples do not fit into this machine's memory.
     """
 
     def __init__(self, config: Config) -> None:
@@ -88,6 +89,8 @@ class DemonstrationData(LightningDataModule):
         trajectories.check(x, name)
         self.x = x
         self.T, self.D = x.shape[1:]
+        # x_0, x_1, and what each of the three settings makes of them.
+        check_memory("sample.num", config.sample.num, 5 * 4 * config.sample.num * self.T * self.D)
         self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
         self.digest = trajectories.digest(x)
         self.train, self.val, self.test = self._split(name)
@@ -96,6 +99,8 @@ class DemonstrationData(LightningDataModule):
         data = self.config.data
         if data.path is not None:
             return f"data.path={data.path}", trajectories.load(data.path)
+        # The whole once more in the splits, and twice while it is generated.
+        check_memory("data.num", data.num, 4 * 4 * data.num * data.horizon * 4)
         x = trajectories.swap(data.num, data.horizon, data.amplitudes, data.jitter, data.seed)
         return "generated demonstrations", trajectories.Demonstrations(x, None)
 
@@ -105,6 +110,10 @@ class DemonstrationData(LightningDataModule):
         val, test = round(data.val_fraction * len(order)), round(data.test_fraction * len(order))
         parts = torch.split(order, [len(order) - val - test, val, test])
         train_split, val_split, test_split = (Split(self.x[i], self.violates[i]) for i in parts)
+        if len(train_split.x) and bool(train_split.violates.all()):
+            raise DemonstrationError(
+                f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, expected D+ too"
+            )
         if data.negatives:
             if not bool(train_split.violates.any()):
                 raise DemonstrationError(
@@ -117,7 +126,9 @@ class DemonstrationData(LightningDataModule):
             train_split, val_split = self._repaired(train_split), self._repaired(val_split)
         for part, split in {"training": train_split, "validation": val_split, "test": test_split}.items():
             if not len(split.x):
-                raise DemonstrationError(f"{name}: no trajectory is left for {part} out of {len(self.x)}")
+                raise DemonstrationError(
+                    f"{name}: no trajectory is left for {part} out of {len(self.x)}, expected one or more"
+                )
         return train_split, val_split, test_split
 
     def _repaired(self, split: Split) -> Split:

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from mlflow.entities import Run
 from rich.console import Console
 
+from conflow.experiment import checkpoints, report, tracking
 from conflow.experiment import config as configuration
-from conflow.experiment import report, tracking
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import evaluate
@@ -29,8 +28,9 @@ def load_model(path: Path, arguments: Sequence[str] = ()) -> ConFlow:
 
     Raises:
         ConfigError: an argument that is none of these.
+        CheckpointError: the file is damaged or foreign.
     """
-    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    checkpoint = checkpoints.load(path)
     described = checkpoint["conflow"]
     config = configuration.override(configuration.from_tree(described["config"]), arguments, SAMPLING)
     model = ConFlow(config, described["T"], described["D"])
@@ -45,13 +45,22 @@ def demonstrations(run: Run, config: Config) -> DemonstrationData:
         DemonstrationError: they are others by now.
     """
     data = DemonstrationData(config)
+    check_data(run, data)
+    return data
+
+
+def check_data(run: Run, data: DemonstrationData) -> None:
+    """Refuse other demonstrations than those that a run was trained on.
+
+    Raises:
+        DemonstrationError: they are others.
+    """
     trained_on = run.data.tags.get("data_digest")
-    if data.digest != trained_on:
+    if trained_on not in (data.digest, None):  # None: interrupted before it was said
         raise DemonstrationError(
-            f"data.path={config.data.path}: found data {data.digest}, expected {trained_on}, on which "
+            f"data.path={data.config.data.path}: found data {data.digest}, expected {trained_on}, on which "
             f"{run.info.run_name} was trained"
         )
-    return data
 
 
 def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from rich.console import Console
 
-from conflow.experiment import compare, config
+from conflow.experiment import config, resume, tracking
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.progress import ProgressDisplay
@@ -52,7 +52,7 @@ def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]
         for seed in seeds
         for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
     ]
-    todo = [cell for cell in cells if not _finished(cell.config)]
+    todo = [cell for cell in cells if not _finished(cell)]
     console.print(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before", highlight=False)
     if todo:
         _train_all(todo, jobs, console)
@@ -66,12 +66,17 @@ def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]
     return sum(cell.failed for cell in todo)
 
 
-def _finished(settings: Config) -> bool:
+def _finished(cell: Cell) -> bool:
+    """Whether a cell is; if it was interrupted, it is told to go on from there."""
     try:
-        digest = DemonstrationData(settings).digest
-        return bool(compare.finished_runs(config_sha=settings.sha(), data_digest=digest))
+        digest = DemonstrationData(cell.config).digest
     except DemonstrationError:
         return False  # the cell itself will say so, and the others go on
+    if tracking.runs("FINISHED", config_sha=cell.config.sha(), data_digest=digest):
+        return True
+    if interrupted := resume.find_cell(cell.config, digest):
+        cell.arguments.append(f"resume={interrupted}")
+    return False
 
 
 def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:

@@ -20,7 +20,7 @@ from conflow.experiment.build import (
     random_stream,
     robot_avoidance,
 )
-from conflow.experiment.config import Config
+from conflow.experiment.config import Config, ConfigError
 from conflow.flow.correction import Correction
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import end, guided_path, interpolate, velocity
@@ -29,6 +29,10 @@ from conflow.flow.sampler import Field, guided, guided_ahead, integrate
 Setting = Literal["none", "robot", "obstacle"]
 SETTINGS: tuple[Setting, ...] = get_args(Setting)
 """The paper's three inference settings: without guidance, guided around the other robot, around an obstacle."""
+
+
+class DivergedError(ConfigError):
+    """A loss or gradient that is not finite: of which step, and what there is from before, in one line."""
 
 
 class ConFlow(LightningModule):
@@ -51,7 +55,10 @@ class ConFlow(LightningModule):
         self.grad_norm = torch.zeros(())
 
     def training_step(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
-        return self.loss(*batch, random_stream("training", self.config.seed, step, device=self.device))
+        loss = self.loss(*batch, random_stream("training", self.config.seed, step, device=self.device))
+        if loss.device.type == "cpu":
+            self.check_finite("the loss", loss, step)
+        return loss
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
         # The same draws at every validation, so that val/loss moves with the network alone.
@@ -115,9 +122,27 @@ class ConFlow(LightningModule):
     def configure_gradient_clipping(self, optimizer: Optimizer, *_: Any, **__: Any) -> None:
         """Clips as the Trainer would, and keeps the norm that clipping computes anyway."""
         self.grad_norm = nn.utils.clip_grad_norm_(self.v.parameters(), self.config.train.clip)
+        if self.grad_norm.device.type == "cpu":
+            self.check_finite("the norm of the gradient", self.grad_norm, self.global_step)
+
+    def check_finite(self, name: str, value: Tensor, step: int) -> None:
+        """Stop the training at a number of this step that is none.
+
+        On the CPU called at every step, before the weights change. On an accelerator reading a number would make the
+        loop wait for it, so there it is left to `TrainingLog`.
+
+        Raises:
+            DivergedError: the value is not finite.
+        """
+        if not bool(value.isfinite()):
+            raise DivergedError(
+                f"{name} is {float(value)}, expected a finite number: step {step}, batch of seed {self.config.seed} "
+                f"and step {step}, train.lr={self.config.train.lr:g}"
+            )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["conflow"] = {"config": self.config.tree(), "T": self.T, "D": self.D}
+        described = {"config": self.config.tree(), "T": self.T, "D": self.D, "threads": torch.get_num_threads()}
+        checkpoint["conflow"] = described
 
 
 def start_and_goal(x: Tensor) -> Tensor:

@@ -3,21 +3,28 @@
 import logging
 import os
 import platform
+import re
+import socket
 import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
+import torch
 from filelock import FileLock
 from lightning.pytorch.loggers import MLFlowLogger
 from mlflow import MlflowClient
 from mlflow.artifacts import download_artifacts
 from mlflow.data.numpy_dataset import from_numpy
 from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
+from mlflow.exceptions import MlflowException
 
+from conflow.experiment import alive
 from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.signals import Interrupted, held
@@ -26,8 +33,13 @@ from conflow.experiment.signals import Interrupted, held
 logging.getLogger("mlflow.store.db.utils").setLevel(logging.WARNING)
 # and shows a bar for every file that it copies.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+# Nor need it print a run's address on a server when the run ends, after what the command itself says last.
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 
 EXPERIMENT = "conflow"
+CONFIG_FILE = "config.yaml"
+MOST = 50_000
+"""Runs that a search may return: as many as MLflow allows."""
 RUNS = Path("runs")
 FLUSH_SECONDS = 5.0
 
@@ -43,19 +55,75 @@ def store_uri() -> str:
 
 
 def client() -> MlflowClient:
-    """A client of the store, which is made together with the experiment where it is missing."""
+    """A client of the store, which is made together with the experiment where it is missing.
+
+    Runs whose process is gone are marked on the way, so that from here on none says RUNNING that is dead.
+    """
     RUNS.mkdir(parents=True, exist_ok=True)
+    _check_reachable(store_uri())
     local = store_uri() == local_uri()
-    artifacts = (RUNS / "artifacts").absolute().as_uri() if local else None
+    # A server decides itself where artifacts go.
+    artifacts = None if store_uri().startswith("http") else (RUNS / "artifacts").absolute().as_uri()
     # Two processes that migrate a new SQLite file at once break it.
     with FileLock(RUNS / ".store.lock"):
         store = MlflowClient(store_uri())
         experiment = store.get_experiment_by_name(EXPERIMENT)
         if experiment is None:
-            store.create_experiment(EXPERIMENT, artifacts)
-        elif local and experiment.artifact_location != artifacts:
+            _create_experiment(store, artifacts)
+            return store
+        if local and experiment.artifact_location != artifacts:
             _relocate(str(experiment.artifact_location), str(artifacts))
+        alive.mark_dead(store, experiment.experiment_id, RUNS / "running")
     return store
+
+
+def runs(status: str | None = None, **tags: str) -> list[Run]:
+    """The runs of a status, or of any, with these tags, the newest first."""
+    store = client()
+    experiment = store.get_experiment_by_name(EXPERIMENT)
+    assert experiment is not None
+    conditions = [f"attributes.status = '{status}'"] if status else []
+    conditions += [f"tags.{name} = '{value}'" for name, value in tags.items()]
+    newest_first = ["attributes.start_time DESC"]
+    return list(
+        store.search_runs([experiment.experiment_id], " AND ".join(conditions), max_results=MOST, order_by=newest_first)
+    )
+
+
+def checkpoints(run_id: str) -> Path:
+    """Where the state of a run's training is kept."""
+    return RUNS / "checkpoints" / run_id
+
+
+def _check_reachable(uri: str) -> None:
+    """Refuse at once what MLflow would try again and again, for minutes and with a warning each time.
+
+    Raises:
+        ConfigError: the local store cannot be opened, or nobody answers where a server should.
+    """
+    server = urlsplit(uri)
+    try:
+        if uri == local_uri() and (RUNS / "mlflow.db").exists():
+            with closing(sqlite3.connect(RUNS / "mlflow.db")) as database:
+                database.execute("PRAGMA schema_version")
+        elif server.scheme in ("http", "https") and server.hostname:
+            port = server.port or (443 if server.scheme == "https" else 80)
+            socket.create_connection((server.hostname, port), timeout=10).close()
+    except sqlite3.Error as error:
+        raise ConfigError(f"{RUNS / 'mlflow.db'}: {error}, expected a store that MLflow can use") from None
+    except (OSError, ValueError) as error:
+        place = f"{server.scheme}://{server.netloc.rpartition('@')[2]}"  # without the password
+        found = getattr(error, "strerror", None) or error
+        raise ConfigError(f"MLFLOW_TRACKING_URI={place}: {found}, expected a server of MLflow that answers") from None
+
+
+def _create_experiment(store: MlflowClient, artifacts: str | None) -> None:
+    try:
+        store.create_experiment(EXPERIMENT, artifacts)
+    except MlflowException:
+        # A command on another machine, which the lock does not reach, may have been faster.
+        if store.get_experiment_by_name(EXPERIMENT) is None:
+            raise
 
 
 def _relocate(old: str, new: str) -> None:
@@ -74,12 +142,7 @@ def find_run(wanted: str) -> Run:
     Raises:
         ConfigError: there is none.
     """
-    store = client()
-    experiment = store.get_experiment_by_name(EXPERIMENT)
-    assert experiment is not None
-    finished = store.search_runs(
-        [experiment.experiment_id], "attributes.status = 'FINISHED'", order_by=["attributes.start_time DESC"]
-    )
+    finished = runs("FINISHED")
     for run in finished:
         if wanted in ("latest", run.info.run_id, run.info.run_name):
             return run
@@ -97,17 +160,30 @@ def artifact(run: Run, name: str) -> Path:
 
 
 class RunLogger(MLFlowLogger):
-    """Lightning's MLflow logger, except that metrics are written in batches and the run's status is left alone."""
+    """Lightning's MLflow logger, except that metrics are written in batches and the run's status is left alone.
 
-    def __init__(self, store: MlflowClient, run_id: str) -> None:
+    Args:
+        store: where the run is.
+        run_id: the run.
+        again: what the store has of a step already is not written a second time. A run that goes on from a checkpoint
+            repeats the steps after it, with the same results.
+    """
+
+    def __init__(self, store: MlflowClient, run_id: str, again: bool = False) -> None:
         super().__init__(EXPERIMENT, tracking_uri=store_uri(), run_id=run_id)
         self.store = store
+        keys = store.get_run(run_id).data.metrics if again else ()
+        self.written = {(key, point.step) for key in keys for point in store.get_metric_history(run_id, key)}
         self.buffer: list[Metric] = []
         self.flushed = time.monotonic()
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         now = int(time.time() * 1000)
-        self.buffer += [Metric(key, float(value), now, step or 0) for key, value in metrics.items() if key != "epoch"]
+        self.buffer += [
+            Metric(key, float(value), now, step or 0)
+            for key, value in metrics.items()
+            if key != "epoch" and (key, step or 0) not in self.written
+        ]
         if time.monotonic() - self.flushed > FLUSH_SECONDS:
             self.save()
 
@@ -126,34 +202,74 @@ class RunLogger(MLFlowLogger):
 
 
 @contextmanager
-def start(config: Config, data: DemonstrationData) -> Iterator[RunLogger]:
+def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -> Iterator[RunLogger]:
     """A run `<ablation>-s<seed>` with its params, tags and data set, which ends with the status that is true.
 
-    FINISHED when the block ends, KILLED when a signal interrupts it, FAILED when it raises.
+    FINISHED when the block ends, KILLED when a signal interrupts it, FAILED when it raises. What not even gets to
+    say so, a process killed or a machine without power, is marked by the next `client`.
+
+    Args:
+        config: the experiment.
+        data: its demonstrations.
+        resumed: the interrupted run to go on with, in place of a new one.
+
+    Raises:
+        ConfigError: another process goes on with it already.
     """
     store = client()
+    logger: RunLogger | None = None
+    status = "FAILED"
+    with alive.claim(RUNS / "running") as lock:
+        try:
+            # A signal between the store's commit and its answer would leave a run that nobody knows of to end.
+            with held():
+                run_id = _create(store, config, lock) if resumed is None else _reopen(store, resumed, lock)
+                logger = RunLogger(store, run_id, again=resumed is not None)
+            _describe(store, run_id, config, data)
+            yield logger
+            status = "FINISHED"
+        except Interrupted:
+            status = "KILLED"
+            raise
+        finally:
+            if logger is not None:
+                _end(logger, status)
+
+
+def _create(store: MlflowClient, config: Config, lock: dict[str, str]) -> str:
     experiment = store.get_experiment_by_name(EXPERIMENT)
     assert experiment is not None
-    name, tags, status = f"{config.ablation}-s{config.seed}", _tags(config), "FAILED"
-    logger: RunLogger | None = None
-    try:
-        # A signal between the store's commit and its answer would leave a run that nobody knows of to end.
-        with held():
-            run_id = store.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id
-            logger = RunLogger(store, run_id)
-        params = [Param(key, str(value)) for key, value in flatten(config.tree()).items()]
-        store.log_batch(run_id, params=params)
-        store.log_dict(run_id, config.tree(), "config.yaml")
-        _log_dataset(store, run_id, data)
-        yield logger
-        status = "FINISHED"
-    except Interrupted:
-        status = "KILLED"
-        raise
-    finally:
-        if logger is not None:
+    name = f"{config.ablation}-s{config.seed}"
+    return str(store.create_run(experiment.experiment_id, run_name=name, tags=_tags(config) | lock).info.run_id)
+
+
+def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
+    run_id = str(run.info.run_id)
+    with FileLock(RUNS / ".store.lock"):
+        if store.get_run(run_id).info.status == "RUNNING":
+            raise ConfigError(f"resume={run.info.run_name}: expected an interrupted run, found one that is RUNNING")
+        again = {"pid": str(os.getpid()), "resumed": str(int(run.data.tags.get("resumed", 0)) + 1)}
+        for key, value in (lock | again).items():
+            store.set_tag(run_id, key, value)
+        store.update_run(run_id, status="RUNNING")
+    return run_id
+
+
+def _describe(store: MlflowClient, run_id: str, config: Config, data: DemonstrationData) -> None:
+    store.log_batch(run_id, params=[Param(key, str(value)) for key, value in flatten(config.tree()).items()])
+    store.log_dict(run_id, config.tree(), CONFIG_FILE)
+    _log_dataset(store, run_id, data)
+
+
+def _end(logger: RunLogger, status: str) -> None:
+    with held():
+        try:
             logger.save()
-            store.set_terminated(run_id, status)
+            logger.store.set_terminated(str(logger.run_id), status)
+        except Exception:
+            # What ended the run is what its user must hear of; a later command marks it.
+            if status == "FINISHED":
+                raise
 
 
 def _tags(config: Config) -> dict[str, str]:
@@ -165,9 +281,19 @@ def _tags(config: Config) -> dict[str, str]:
         "git_sha": sha if sha is not None else "unknown",
         "git_dirty": str(bool(dirty)).lower() if dirty is not None else "unknown",
         "config_sha": config.sha(),
-        "host": platform.node(),
         "pid": str(os.getpid()),
+        "versions": ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "mlflow")),
+        "hardware": _hardware(),
+        "threads": str(torch.get_num_threads()),
     }
+
+
+def _hardware() -> str:
+    """The processor, how many cores it has, and the accelerator."""
+    names = Path("/proc/cpuinfo")
+    models = re.findall(r"model name\s*: (.*)", names.read_text()) if names.exists() else []
+    cpu = f"{models[0] if models else platform.machine()}, {os.cpu_count()} cores"
+    return f"{cpu}, {torch.cuda.get_device_name()}" if torch.cuda.is_available() else cpu
 
 
 def _git(*arguments: str) -> str | None:
@@ -182,7 +308,12 @@ def _git(*arguments: str) -> str | None:
 def _log_dataset(store: MlflowClient, run_id: str, data: DemonstrationData) -> None:
     name = Path(data.config.data.path).name if data.config.data.path else "generated swaps"
     dataset = from_numpy(data.x.numpy(), targets=data.violates.numpy(), name=name, digest=data.digest)
-    store.log_inputs(run_id, [DatasetInput(dataset._to_mlflow_entity(), [InputTag("mlflow.data.context", "training")])])
+    inputs = [DatasetInput(dataset._to_mlflow_entity(), [InputTag("mlflow.data.context", "training")])]
+    try:
+        store.log_inputs(run_id, inputs)
+    except MlflowException:
+        # Of two runs that add the same new data set at once MLflow fails the slower one; by now the data set is there.
+        store.log_inputs(run_id, inputs)
     description = {
         "data_digest": data.digest,
         "data_violating_share": f"{data.violates.float().mean():.4f}",

@@ -1,59 +1,102 @@
 """One experiment from its config to a finished MLflow run."""
 
 import logging
+import shutil
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
 
 import lightning
+import torch
 from lightning import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from mlflow.entities import Run
 from rich.console import Console
 
-from conflow.experiment import figures, report, tracking
+from conflow.experiment import checkpoints, figures, report, resume, tracking
 from conflow.experiment.build import fitted
-from conflow.experiment.callbacks import Evaluate, TrainingLog, TrainingProgress
+from conflow.experiment.callbacks import TrainingLog, TrainingProgress, ValidationSamples
+from conflow.experiment.checkpoints import AtomicCheckpointIO, Checkpoints
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.evaluation import evaluate
 from conflow.experiment.finished import MODEL_FILE
-from conflow.experiment.module import ConFlow
+from conflow.experiment.module import ConFlow, DivergedError
 from conflow.experiment.progress import ProgressDisplay
 
 
-def train(config: Config, console: Console) -> str:
+def train(config: Config, console: Console, wanted: str = "") -> str:
     """Train, sample, evaluate and log one experiment; the id of its run.
+
+    Args:
+        config: the experiment.
+        console: for progress and results.
+        wanted: an interrupted run of this experiment to go on with: its id, its name, or "latest".
 
     Raises:
         DemonstrationError: before anything is tracked.
+        ConfigError: there is no such run, or it is of another experiment.
+        CheckpointError: a checkpoint could not be written.
+        DivergedError: a loss or gradient was not finite.
     """
     _quiet()
     lightning.seed_everything(config.seed, verbose=False)
     data = DemonstrationData(config)
     model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
     model.fit(data.train.feasible().x)
-    with tracking.start(config, data) as logger:
+    interrupted = resume.find(wanted) if wanted else None
+    checkpoint = _continued(interrupted, config, data, console) if interrupted else None
+    with tracking.start(config, data, interrupted) as logger:
         run_id = str(logger.run_id)
         if config.source.fit:
             kernel = model.config.source
             logger.log_metrics({"source/length_scale": kernel.length_scale, "source/sigma_f": kernel.sigma_f}, 0)
         with ProgressDisplay(console) as display:
-            evaluation = Evaluate(data, display)
-            callbacks = [evaluation, TrainingLog(config.train.log_every), TrainingProgress(display)]
-            trainer = _trainer(config, logger, callbacks)
-            trainer.fit(model, data)
+            trainer = _trainer(config, logger, data, display)
+            try:
+                trainer.fit(model, data, ckpt_path=checkpoint)
+            except DivergedError as error:
+                raise DivergedError(f"{error}; {_last_good(run_id)}") from None
+            evaluation = evaluate(model.eval(), data.test.x, display)
+        # One value a run: at step 0 MLflow draws bars that compare runs, at any other a line of one point.
+        logger.log_metrics(evaluation.keyed(), 0)
         with tempfile.TemporaryDirectory() as folder:
             trainer.save_checkpoint(Path(folder, MODEL_FILE), weights_only=True)
             pictures = {
-                "page": figures.page(model, data, evaluation.done),
+                "page": figures.page(model, data, evaluation),
                 "demonstrations": figures.demonstrations(data),
-                "sources": figures.sources(model, evaluation.done),
+                "sources": figures.sources(model, evaluation),
             }
             figures.save(pictures, Path(folder, "figures"))
             logger.store.log_artifacts(run_id, folder)
+    shutil.rmtree(tracking.checkpoints(run_id))  # what a finished run needs is among its artifacts
     title = f"{config.ablation}-s{config.seed}, preset {config.preset}"
-    console.print(report.results_table(evaluation.done.results, title))
+    console.print(report.results_table(evaluation.results, title))
     return run_id
+
+
+def _continued(run: Run, config: Config, data: DemonstrationData, console: Console) -> Path | None:
+    """The checkpoint from which a run goes on, or None from its beginning."""
+    resume.check(run, config, data)
+    path, refused = checkpoints.newest(tracking.checkpoints(str(run.info.run_id)))
+    for reason in refused:
+        console.print(f"{reason}; going on from the one before it", highlight=False, soft_wrap=True)
+    step = 0
+    if path is not None:
+        state = checkpoints.load(path)
+        step = state["global_step"]
+        # Another number of threads adds up in another order, and bits differ.
+        torch.set_num_threads(state["conflow"]["threads"])
+    console.print(
+        f"Going on with run {run.info.run_name} from step {step} of {config.train.max_steps}", highlight=False
+    )
+    return path
+
+
+def _last_good(run_id: str) -> str:
+    path, _ = checkpoints.newest(tracking.checkpoints(run_id))
+    if path is None:
+        return "there is no checkpoint from before"
+    return f"the last good checkpoint is {path}, of step {checkpoints.load(path)['global_step']}"
 
 
 def _quiet() -> None:
@@ -63,20 +106,23 @@ def _quiet() -> None:
         warnings.filterwarnings("ignore", message)
 
 
-def _trainer(config: Config, logger: tracking.RunLogger, callbacks: list[Any]) -> Trainer:
+def _trainer(config: Config, logger: tracking.RunLogger, data: DemonstrationData, display: ProgressDisplay) -> Trainer:
     interval = min(config.train.val_every, config.train.max_steps)
-    checkpoints = tracking.RUNS / "checkpoints" / str(logger.run_id)
-    checkpoint = ModelCheckpoint(
-        checkpoints, filename="last", every_n_train_steps=interval, enable_version_counter=False
-    )
     return Trainer(
         accelerator="auto",
         devices=1,
         logger=logger,
-        callbacks=[*callbacks, checkpoint],
+        callbacks=[
+            TrainingLog(config.train.log_every),
+            TrainingProgress(display),
+            ValidationSamples(data),
+            Checkpoints(tracking.checkpoints(str(logger.run_id)), interval),
+        ],
+        plugins=[AtomicCheckpointIO()],
         max_steps=config.train.max_steps,
         val_check_interval=interval,
         num_sanity_val_steps=0,
+        enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
     )

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 ENDPOINTS = (0, -1)
 LONGEST = 10.0
 """Largest length scale that a fit returns: straight demonstrations would push it to infinity."""
+SMALLEST = 1e-6
+"""Smallest parameter that a fit returns: white noise would push the length scale to zero, still ones sigma_f."""
 
 
 class Source(nn.Module):
@@ -132,8 +134,13 @@ def fit_rbf(x: Tensor, index: Sequence[int] = (), epsilon: float = 1e-6) -> tupl
         x: demonstrations, (N, T, D).
         index: the conditioned waypoints O.
         epsilon: the kernel's, which stays as it is.
+
+    Raises:
+        ValueError: there are no demonstrations, none of their waypoints is free, or epsilon is too small.
     """
     N, T, D = x.shape
+    if not x.numel() or len(index) >= T:
+        raise ValueError(f"demonstrations of shape {(N, T, D)}: expected some, with a waypoint that is not conditioned")
     x = x.double()
     S = torch.einsum("nid,njd->ij", x, x) / (N * D)
     observed, _ = _observations(T, index, ())
@@ -144,20 +151,26 @@ def fit_rbf(x: Tensor, index: Sequence[int] = (), epsilon: float = 1e-6) -> tupl
     def deviance() -> Tensor:
         optimizer.zero_grad()
         length_scale, sigma_f = log_parameters.exp()
-        K = rbf(T, length_scale.clamp(max=LONGEST), sigma_f, epsilon)
+        K = rbf(T, length_scale.clamp(SMALLEST, LONGEST), sigma_f.clamp(SMALLEST), epsilon)
         W = torch.linalg.solve(K[observed][:, observed], K[observed][:, free]).mT
         Sigma = K[free][:, free] - W @ K[observed][:, free]
         A = torch.zeros(len(free), T, dtype=torch.float64)
         A[:, free] = torch.eye(len(free), dtype=torch.float64)
         A = A.index_add(1, observed, -W)
-        L = torch.linalg.cholesky(Sigma)
+        try:
+            L = torch.linalg.cholesky(Sigma)
+        except RuntimeError:
+            raise ValueError(
+                f"epsilon={epsilon:g}: expected a larger one, with which length_scale={length_scale.item():.3g} and "
+                f"sigma_f={sigma_f.item():.3g} can be factored"
+            ) from None
         value = 2 * L.diagonal().log().sum() + torch.cholesky_solve(A @ S @ A.mT, L).diagonal().sum()
         value.backward()
         return value
 
     optimizer.step(deviance)
     fitted: list[float] = log_parameters.detach().exp().tolist()
-    return min(fitted[0], LONGEST), fitted[1]
+    return max(SMALLEST, min(fitted[0], LONGEST)), max(SMALLEST, fitted[1])
 
 
 def _check_covariance(K: Tensor) -> None:

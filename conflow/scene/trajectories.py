@@ -23,6 +23,9 @@ MARGIN = 1e-3
 class DemonstrationError(ValueError):
     """Demonstrations that cannot be used, with the reason in one line."""
 
+    def __init__(self, reason: str) -> None:
+        super().__init__(" ".join(reason.split()))
+
 
 class Demonstrations(NamedTuple):
     """Trajectories x (N, T, D) and, where their author labelled them, the violations M (N,)."""
@@ -154,10 +157,15 @@ def load(path: str | Path) -> Demonstrations:
         DemonstrationError: the file is missing or unreadable, or its arrays are not of that kind.
     """
     try:
+        if not Path(path).is_file():  # of a pipe, reading would never end
+            raise FileNotFoundError
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("x", "violates") if name in file}
+            # What of a foreign archive is no array comes as bytes.
+            arrays = {name: np.asarray(file[name]) for name in ("x", "violates") if name in file}
     except FileNotFoundError:
-        raise DemonstrationError(f"data.path={path}: no such file") from None
+        raise DemonstrationError(f"data.path={path}: no such file, expected an .npz file with numeric arrays") from None
+    except MemoryError as error:
+        raise DemonstrationError(f"data.path={path}: {error}, expected arrays that fit into memory") from None
     except Exception:  # a damaged file fails in any of a dozen ways, from zlib.error to TokenError
         raise DemonstrationError(f"data.path={path}: expected an .npz file with numeric arrays") from None
     if "x" not in arrays:
@@ -170,9 +178,9 @@ def load(path: str | Path) -> Demonstrations:
             f"data.path={path}: violates holds {violates.dtype} of shape {violates.shape}, "
             f"expected bool of shape {x.shape[:1]}"
         )
-    return Demonstrations(
-        torch.from_numpy(x.astype(np.float32)), None if violates is None else torch.from_numpy(violates)
-    )
+    with np.errstate(over="ignore"):  # `check` refuses what becomes infinite
+        x = x.astype(np.float32)
+    return Demonstrations(torch.from_numpy(x), None if violates is None else torch.from_numpy(violates))
 
 
 def check(x: Tensor, name: str) -> None:
@@ -192,13 +200,13 @@ def check(x: Tensor, name: str) -> None:
     if not bool(finite.all()):
         raise DemonstrationError(
             f"{name}: {int((~finite).sum())} trajectories hold NaN or infinity, the first is "
-            f"{int((~finite).nonzero()[0])}"
+            f"{int((~finite).nonzero()[0])}, expected finite numbers in the workspace [-1, 1]"
         )
     outside = x.abs().flatten(1).amax(dim=1) > 1
     if bool(outside.any()):
         raise DemonstrationError(
             f"{name}: {int(outside.sum())} trajectories leave the workspace [-1, 1], the first is "
-            f"{int(outside.nonzero()[0])}"
+            f"{int(outside.nonzero()[0])}, expected all of them inside"
         )
 
 
@@ -208,9 +216,9 @@ def save(path: str | Path, x: Tensor) -> None:
     Raises:
         DemonstrationError: the name does not end in .npz, there is such a file, or it cannot be written.
     """
-    path = Path(path)
-    if path.suffix != ".npz":
+    if Path(path).suffix != ".npz":
         raise DemonstrationError(f"out={path}: expected a name that ends in .npz")
+    path = Path(path)
     try:
         with tempfile.TemporaryDirectory(prefix=".conflow-", dir=path.parent) as folder:
             part = Path(folder, path.name)

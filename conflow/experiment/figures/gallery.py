@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from mlflow.entities import Run
 from rich.console import Console
 
-from conflow.experiment import compare, diagnostics, tracking
+from conflow.experiment import diagnostics, tracking
 from conflow.experiment.build import random_stream
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
@@ -37,7 +37,7 @@ def draw(wanted: Sequence[str], console: Console) -> None:
 
 def draw_front(settings: Config, console: Console) -> None:
     """Draw what fewer collisions cost, over all finished runs of a preset on its demonstrations."""
-    runs = compare.finished_runs(preset=settings.preset, data_digest=DemonstrationData(settings).digest)
+    runs = tracking.runs("FINISHED", preset=settings.preset, data_digest=DemonstrationData(settings).digest)
     if not runs:
         console.print(f"front.png is left out, no run of preset {settings.preset} has finished", highlight=False)
         return

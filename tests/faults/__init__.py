@@ -1,0 +1,1 @@
+"""Faults that are really caused: processes killed, disks filled, files broken, bad input given."""

@@ -1,0 +1,57 @@
+"""A grid that is interrupted, and one of whose cells fails."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+from conflow.scene.constraint import RobotAvoidance
+from conflow.scene.robots import PointRobots
+from conflow.scene.trajectories import swap
+from tests.faults import processes
+from tests.faults.processes import runs
+
+GRID = ("ablations", "preset=smoke", "seeds=0", "ablations=cgp fm")
+
+
+def statuses(folder: Path) -> list[tuple[str, str]]:
+    """Name and status of every run, the oldest first."""
+    if not (folder / "runs" / "mlflow.db").exists():
+        return []
+    return [(str(run.info.run_name), str(run.info.status)) for run in reversed(runs(folder))]
+
+
+def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    stopped = processes.start(tmp_path, *GRID)
+    deadline = time.monotonic() + 180
+    # The grid has made the store when it says this; to look at it earlier would race with its migration.
+    output = tmp_path / "output"
+    while not (output.exists() and "2 cells, 0 of them" in output.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.3)
+    # The second cell has begun: the first one is finished and must not be trained again.
+    while len(statuses(tmp_path)) < 2 and time.monotonic() < deadline:
+        time.sleep(0.3)
+    os.kill(stopped.pid, signal.SIGINT)
+    stopped.join(60)
+    assert stopped.exitcode == 128 + signal.SIGINT, output.read_text()
+    assert statuses(tmp_path) == [("cgp-s0", "FINISHED"), ("fm-s0", "KILLED")]
+    code, said = processes.run(tmp_path, *GRID)
+    assert code == 0, said
+    assert "2 cells, 1 of them finished before" in said
+    assert "Table 1" in said
+    # The same run went on.
+    assert statuses(tmp_path) == [("cgp-s0", "FINISHED"), ("fm-s0", "FINISHED")]
+    assert runs(tmp_path)[0].data.tags["resumed"] == "1"
+
+
+def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
+    x = swap(600)
+    feasible = x[~RobotAvoidance(PointRobots(2)).violation(x)]
+    np.savez(tmp_path / "feasible.npz", x=feasible.numpy())
+    code, output = processes.run(tmp_path, *GRID, "data.path=feasible.npz")
+    assert code == 2
+    assert "cgp-s0 failed: conflow: data.path=feasible.npz: no trajectory for training violates" in output
+    assert "1 cells failed" in output
+    assert statuses(tmp_path) == [("fm-s0", "FINISHED")]
