@@ -1,4 +1,4 @@
-"""The paper's tables and claims and a table of our own, filled from finished runs in MLflow alone."""
+"""The paper's tables and claims and tables of our own, filled from finished runs or from the records of them alone."""
 
 import csv
 import io
@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Literal, cast, get_args
 
-from mlflow.entities import Run
 from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
-from conflow.experiment import config, tracking
+from conflow.experiment import record
 from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
+from conflow.experiment.record import Record
 
 Format = Literal["table", "markdown", "csv", "json"]
 Verdict = Literal["holds", "reversed", "not distinguishable", "no runs"]
@@ -55,6 +55,13 @@ QUALITIES = {
     "test/none/start_error": "start error per robot",
     "test/none/end_error": "end error per robot",
 }
+# The other readings of smoothness; the paper prints numbers of one, and does not say of which.
+SMOOTHNESS = {
+    "test/none/peak_acceleration_median": "largest second difference, median",
+    "test/none/peak_acceleration_p95": "largest second difference, 95th percentile",
+    "test/none/squared_acceleration_median": "squared second difference, median",
+    "test/none/squared_acceleration_p95": "squared second difference, 95th percentile",
+}
 # Whether a low collision rate was bought with something else.
 GUARDS = {
     "test/none/robot_collision": "robot-collision rate",
@@ -65,6 +72,16 @@ GUARDS = {
     "test/none/success": "success rate",
     "test/none/outside": "outside rate",
 }
+READINGS = {
+    "none/robot_collision": "none: robot",
+    "robot/robot_collision": "robot: robot",
+    "obstacle/robot_collision": "obstacle: robot",
+    "obstacle/object_collision": "obstacle: object",
+    "none/smoothness_median": "smoothness, median",
+    "none/start_error": "start error per robot",
+}
+PAPER_TRAJECTORIES = 256
+"""Of which the paper's rates in Table 1 are the fractions."""
 # What the paper prints, Table 1 by row and Table 2 by column. Its FM (D+ and D-) cells for no and for robot guidance
 # look exchanged: a model of data of which 30 % collide cannot give 0.055 unguided.
 PAPER_1 = {
@@ -88,6 +105,8 @@ class Cell:
         seed_low, seed_high: the smallest and the largest of the seeds.
         count: trajectories that the rate counts, over all seeds, of a rate.
         trajectories: over all seeds.
+        preset: the scale that it was measured at.
+        paper_p: of Fisher's exact test between this rate and the paper's.
     """
 
     table: str
@@ -102,6 +121,8 @@ class Cell:
     seeds: int
     count: int | None
     trajectories: int
+    preset: str
+    paper_p: float | None
 
 
 @dataclass(frozen=True)
@@ -116,23 +137,13 @@ class Claim:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The cells of all tables, the claims, and which runs they come from."""
+    """The cells of all tables, the claims, which runs they come from, and how to make the runs of a row again."""
 
     preset: str
     cells: list[Cell]
     claims: list[Claim]
     runs: dict[str, list[str]]
-
-
-def finished_runs(**tags: str) -> list[Run]:
-    """FINISHED runs with these tags, the newest first."""
-    store = tracking.client()
-    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
-    assert experiment is not None
-    conditions = ["attributes.status = 'FINISHED'", *(f"tags.{name} = '{value}'" for name, value in tags.items())]
-    return list(
-        store.search_runs([experiment.experiment_id], " AND ".join(conditions), order_by=["attributes.start_time DESC"])
-    )
+    commands: dict[str, str]
 
 
 def checked_format(name: str) -> Format:
@@ -153,14 +164,57 @@ def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
     Raises:
         ConfigError: there is no such run.
     """
-    runs = {ablation: _by_seed(ablation, preset, arguments) for ablation in _ablations()}
-    runs = {ablation: by_seed for ablation, by_seed in runs.items() if by_seed}
-    if not runs:
+    records = record.from_store(preset, arguments)
+    if not records:
         raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
-    cells = [cell for cell in (*_table_1(runs), *_table_2(runs), *_table_3(runs)) if cell is not None]
+    return _comparison(preset, _grouped(records, lambda one: one.ablation), {})
+
+
+def collect_reference() -> Comparison:
+    """Compare the records under runs/reference/: each ablation at its largest scale, and other readings of the paper.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    records = record.from_files()
+    scale = {"smoke": 0, "quick": 1, "paper": 2}
+    largest = {one.ablation: one.preset for one in sorted(records, key=lambda one: scale.get(one.preset, 0))}
+    plain = [one for one in records if not one.changes() and one.preset == largest[one.ablation]]
+    changed = [one for one in records if one.changes()]
+    presets = " and ".join(sorted({one.preset for one in records}))
+    return _comparison(presets, _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading))
+
+
+def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[str, list[Record]]:
+    """Records by name, those of METHODS first and in their order."""
+    rank = {ablation: i for i, ablation in enumerate(METHODS)}
+    groups: dict[str, list[Record]] = {}
+    for one in sorted(records, key=lambda one: (rank.get(one.ablation, len(rank)), name(one), one.seed)):
+        groups.setdefault(name(one), []).append(one)
+    return groups
+
+
+def _reading(one: Record) -> str:
+    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join(one.changes())}"
+
+
+def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> Comparison:
+    cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *(_table_4(runs, readings) if readings else [])]
+    named = {METHODS.get(ablation, ablation): of_row for ablation, of_row in runs.items()} | dict(readings)
     return Comparison(
-        preset, cells, _claims(runs), {name: [_id(run) for run in by_seed] for name, by_seed in runs.items()}
+        preset,
+        [cell for cell in cells if cell is not None],
+        _claims(runs),
+        {name: [one.run_id for one in of_row] for name, of_row in (dict(runs) | dict(readings)).items()},
+        {name: _command(of_row) for name, of_row in named.items()},
     )
+
+
+def _command(runs: Sequence[Record]) -> str:
+    """What makes these runs again."""
+    seeds, one = " ".join(str(of_seed.seed) for of_seed in runs), runs[0]
+    arguments = f" ARGS='{' '.join(one.changes())}'" if one.changes() else ""
+    return f'make ablations ABLATIONS={one.ablation} SEEDS="{seeds}" PRESET={one.preset}{arguments}'
 
 
 def render(comparison: Comparison, form: Format, console: Console) -> None:
@@ -181,28 +235,7 @@ def render(comparison: Comparison, form: Format, console: Console) -> None:
                 console.print(_table(title, header, rows))
 
 
-def _ablations() -> list[str]:
-    """Those of `METHODS` that exist in its order, then the others by name."""
-    names = config.names("ablation")
-    return [*(name for name in METHODS if name in names), *(name for name in names if name not in METHODS)]
-
-
-def _by_seed(ablation: str, preset: str, arguments: Sequence[str]) -> list[Run]:
-    """The newest run of each seed, by seed."""
-    newest: dict[int, Run] = {}
-    for run in finished_runs(ablation=ablation, preset=preset):
-        seed = int(run.data.tags["seed"])
-        asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
-        if run.data.tags["config_sha"] == asked.sha():
-            newest.setdefault(seed, run)
-    return [newest[seed] for seed in sorted(newest)]
-
-
-def _id(run: Run) -> str:
-    return str(run.info.run_id)
-
-
-def _table_1(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
+def _table_1(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     cells = []
     for ablation, by_seed in runs.items():
         papers = itertools.chain(PAPER_1.get(ablation, ()), itertools.repeat(None))
@@ -211,16 +244,18 @@ def _table_1(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
     return cells + _without_model("1", COLLISIONS, runs)
 
 
-def _table_2(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
+def _table_2(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     return [
         _cell("2", row, METHODS[ablation], paper, metric, runs[ablation])
         for ablation, papers in PAPER_2.items()
         if ablation in runs
-        for (metric, row), paper in zip(QUALITIES.items(), papers, strict=True)
+        for (metric, row), paper in zip(
+            (QUALITIES | SMOOTHNESS).items(), (*papers, *itertools.repeat(None, len(SMOOTHNESS))), strict=True
+        )
     ]
 
 
-def _table_3(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
+def _table_3(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     cells = [
         _cell("3", METHODS.get(ablation, ablation), column, None, metric, by_seed)
         for ablation, by_seed in runs.items()
@@ -229,7 +264,20 @@ def _table_3(runs: Mapping[str, list[Run]]) -> list[Cell | None]:
     return cells + _without_model("3", GUARDS, runs)
 
 
-def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, list[Run]]) -> list[Cell | None]:
+def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> list[Cell | None]:
+    """ConFlow under other readings: trained with them, or, where that is enough, sampled and judged again with them."""
+    rows = [("default", "test/", runs.get("cgp", [])), *((name, "test/", of_row) for name, of_row in readings.items())]
+    for name, of_row in runs.items():
+        labels = sorted({key.split("/")[1] for one in of_row for key in one.metrics if key.startswith("evaluate/")})
+        rows += [(f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", of_row) for label in labels]
+    return [
+        _cell("4", row, column, None, prefix + metric, of_row)
+        for row, prefix, of_row in rows
+        for metric, column in READINGS.items()
+    ]
+
+
+def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     """Rows of the sources and of the demonstrations, in those of the columns that are without guidance."""
     every = [run for by_seed in runs.values() for run in by_seed]
     rows = [(f"source {name}", "source", runs[name]) for name in SOURCES if name in runs]
@@ -245,32 +293,35 @@ def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, li
     return cells
 
 
-def _measured(metric: str, runs: Sequence[Run]) -> bool:
+def _measured(metric: str, runs: Sequence[Record]) -> bool:
     """Whether all runs, some perhaps logged before there was this metric, have it or the count behind it."""
-    return all(metric in run.data.metrics or f"{metric}_count" in run.data.metrics for run in runs)
+    return all(metric in run.metrics or f"{metric}_count" in run.metrics for run in runs)
 
 
-def _cell(table: str, row: str, column: str, paper: float | None, metric: str, runs: Sequence[Run]) -> Cell | None:
+def _cell(table: str, row: str, column: str, paper: float | None, metric: str, runs: Sequence[Record]) -> Cell | None:
     """The number, or None where a run lacks the metric."""
     if not runs or not _measured(metric, runs):
         return None
-    trajectories = [int(run.data.metrics[metric.rsplit("/", 1)[0] + "/num"]) for run in runs]
+    trajectories = [int(run.metrics[metric.rsplit("/", 1)[0] + "/num"]) for run in runs]
     count, low, high = None, None, None
-    if f"{metric}_count" in runs[0].data.metrics:
-        counts = [int(run.data.metrics[f"{metric}_count"]) for run in runs]
+    if f"{metric}_count" in runs[0].metrics:
+        counts = [int(run.metrics[f"{metric}_count"]) for run in runs]
         values = [of_seed / total for of_seed, total in zip(counts, trajectories, strict=True)]
         count = sum(counts)
         value = count / sum(trajectories)
         low, high = wilson(count, sum(trajectories))
     else:
-        values = [run.data.metrics[metric] for run in runs]
+        values = [run.metrics[metric] for run in runs]
         value = statistics.mean(values)
-    return Cell(
-        table, row, column, paper, value, low, high, min(values), max(values), len(runs), count, sum(trajectories)
-    )
+    paper_p = None
+    if paper is not None and count is not None and table == "1":
+        of_paper = round(paper * PAPER_TRAJECTORIES)
+        paper_p = _fisher_p(count, sum(trajectories), of_paper, PAPER_TRAJECTORIES)
+    across = (min(values), max(values), len(runs), count, sum(trajectories), runs[0].preset, paper_p)
+    return Cell(table, row, column, paper, value, low, high, *across)
 
 
-def _claims(runs: Mapping[str, list[Run]]) -> list[Claim]:
+def _claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
     """The paper's claims and ours of `plus` in words, each as "a is lower than b"."""
     none, *_ = COLLISIONS
     rates = [
@@ -294,10 +345,10 @@ def _claims(runs: Mapping[str, list[Run]]) -> list[Claim]:
     ]
 
 
-Test = Callable[[str, Sequence[Run], Sequence[Run]], tuple[float, float, float]]
+Test = Callable[[str, Sequence[Record], Sequence[Record]], tuple[float, float, float]]
 
 
-def _compare(runs: Mapping[str, list[Run]], text: str, lower: str, higher: str, metric: str, test: Test) -> Claim:
+def _compare(runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str, test: Test) -> Claim:
     if lower not in runs or higher not in runs:
         missing = " and ".join(name for name in (lower, higher) if name not in runs)
         return Claim(text, "no runs", None, f"no finished run of {missing}")
@@ -308,20 +359,24 @@ def _compare(runs: Mapping[str, list[Run]], text: str, lower: str, higher: str, 
     return Claim(text, verdict, p, f"{a:.4f} against {b:.4f}, {len(runs[lower])} and {len(runs[higher])} seeds")
 
 
-def _fisher(metric: str, lower: Sequence[Run], higher: Sequence[Run]) -> tuple[float, float, float]:
+def _fisher(metric: str, lower: Sequence[Record], higher: Sequence[Record]) -> tuple[float, float, float]:
     """Both pooled rates, and the p of Fisher's exact test on the counts."""
     a, b = (_cell("", "", "", None, metric, runs) for runs in (lower, higher))
     assert a is not None
     assert b is not None
     assert a.count is not None
     assert b.count is not None
-    table = [[a.count, a.trajectories - a.count], [b.count, b.trajectories - b.count]]
-    return a.value, b.value, float(stats.fisher_exact(table).pvalue)
+    return a.value, b.value, _fisher_p(a.count, a.trajectories, b.count, b.trajectories)
 
 
-def _permutation(metric: str, lower: Sequence[Run], higher: Sequence[Run]) -> tuple[float, float, float]:
+def _fisher_p(count: int, trajectories: int, other_count: int, other_trajectories: int) -> float:
+    table = [[count, trajectories - count], [other_count, other_trajectories - other_count]]
+    return float(stats.fisher_exact(table).pvalue)
+
+
+def _permutation(metric: str, lower: Sequence[Record], higher: Sequence[Record]) -> tuple[float, float, float]:
     """Both means over seeds, and the p of the exact test that permutes the seeds between the two."""
-    values = [[run.data.metrics[metric] for run in runs] for runs in (lower, higher)]
+    values = [[run.metrics[metric] for run in runs] for runs in (lower, higher)]
     a, b = map(statistics.mean, values)
     pooled = values[0] + values[1]
     observed = abs(a - b)
@@ -338,8 +393,9 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
     preset = comparison.preset
     tables = {
         "1": (f"Table 1: collision rates, preset {preset} (setting: what is hit)", COLLISIONS),
-        "2": (f"Table 2: sources, without guidance, preset {preset}", QUALITIES),
+        "2": (f"Table 2: sources, without guidance, preset {preset}", QUALITIES | SMOOTHNESS),
         "3": (f"Table 3: quality without guidance, preset {preset}", GUARDS),
+        "4": (f"Table 4: what the paper leaves open, changed one at a time, preset {preset}", READINGS),
     }
     sheets = []
     for table, (title, metrics) in tables.items():
@@ -349,7 +405,9 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         for row in _ordered((row for row, _ in cells), metrics.values()):
             of_row = [cells.get((row, column)) for column in columns]
             known = next(cell for cell in of_row if cell is not None)
-            size = f"{known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
+            size = (
+                f"{known.preset}, {known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
+            )
             rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row)])
         if cells:
             sheets.append((title, ["", *columns], rows))
@@ -358,6 +416,7 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         for claim in comparison.claims
     ]
     sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
+    sheets.append(("The runs of a row again", ["row", "command"], [list(pair) for pair in comparison.commands.items()]))
     return sheets
 
 
@@ -376,7 +435,8 @@ def _text(cell: Cell) -> str:
     if cell.seeds > 1:
         parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
     if cell.paper is not None:
-        parts.append(f"paper {cell.paper:.4g}")
+        agrees = "" if cell.paper_p is None else ", differs" if cell.paper_p < LEVEL else ", not distinguishable"
+        parts.append(f"paper {cell.paper:.4g}{agrees}")
     return "\n".join(parts)
 
 

@@ -1,0 +1,114 @@
+"""What is compared of a finished run: read from MLflow, or from a file of record under runs/reference/."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from mlflow.entities import Run
+
+from conflow.experiment import config, tracking
+from conflow.experiment.config import ConfigError, flatten
+
+PUBLISHED = ("test/", "without_model/", "source/", "evaluate/")
+ORIGIN = ("git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run's numbers, and all that is needed to get them again.
+
+    Attributes:
+        run_id: in the store that it was tracked in.
+        settings: its whole config, flat, as text.
+        metrics: the results, without the curves of training.
+        origin: the program's revision, versions, hardware and data that it was made with.
+        seconds: from the run's start to its end.
+    """
+
+    run_id: str
+    ablation: str
+    preset: str
+    seed: int
+    settings: dict[str, str]
+    metrics: dict[str, float]
+    origin: dict[str, str]
+    seconds: float
+
+    @classmethod
+    def of(cls, run: Run) -> "Record":
+        """The record of a finished run."""
+        tags = run.data.tags
+        metrics = {key: value for key, value in sorted(run.data.metrics.items()) if key.startswith(PUBLISHED)}
+        origin = {key: tags[key] for key in ORIGIN if key in tags}
+        seconds = (run.info.end_time - run.info.start_time) / 1000
+        settings = dict(sorted(run.data.params.items()))
+        where = (str(run.info.run_id), tags["ablation"], tags["preset"], int(tags["seed"]))
+        return cls(*where, settings, metrics, origin, seconds)
+
+    @classmethod
+    def read(cls, path: Path) -> "Record":
+        """The record that `write` left in a file.
+
+        Raises:
+            ConfigError: it is none.
+        """
+        try:
+            return cls(**json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise ConfigError(f"{path}: expected the record of a run, found {' '.join(str(error).split())}") from None
+
+    def write(self, folder: Path) -> Path:
+        """The file of this record in a folder; where one of another run of the same experiment was, it is replaced."""
+        # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
+        name = re.sub(r"[^\w.=+-]+", "_", "-".join([self.ablation, self.preset, *self.changes(), f"s{self.seed}"]))
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{name}.json"
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        return path
+
+    def changes(self) -> list[str]:
+        """The settings that are not those of the ablation at the preset, as arguments."""
+        named = flatten(config.load([f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]).tree())
+        return [f"{key}={value}" for key, value in self.settings.items() if value != str(named.get(key, value))]
+
+    def same_but_for_seed(self) -> tuple[str, ...]:
+        """What its runs of other seeds have in common with it."""
+        return (self.ablation, self.preset, *self.changes())
+
+
+def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
+    """The newest finished run of every ablation and seed at a preset, with arguments as they were trained."""
+    newest: dict[tuple[str, int], Record] = {}
+    for run in tracking.runs("FINISHED", preset=preset):
+        ablation, seed = run.data.tags["ablation"], int(run.data.tags["seed"])
+        if ablation not in config.names("ablation"):
+            continue
+        asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
+        if run.data.tags["config_sha"] == asked.sha():
+            newest.setdefault((ablation, seed), Record.of(run))
+    return sorted(newest.values(), key=lambda record: record.seed)
+
+
+def from_files() -> list[Record]:
+    """All records under runs/reference/, by seed.
+
+    Raises:
+        ConfigError: there is none, or a file is none.
+    """
+    paths = sorted(FOLDER.glob("*.json"))
+    if not paths:
+        raise ConfigError(f"reference: expected records in {FOLDER}, found none; try: make reference")
+    return sorted(map(Record.read, paths), key=lambda record: record.seed)
+
+
+def publish(preset: str) -> list[Path]:
+    """Write the newest finished run of every experiment and seed at a preset into runs/reference/."""
+    newest: dict[str, Run] = {}
+    for run in tracking.runs("FINISHED", preset=preset):
+        newest.setdefault(run.data.tags["config_sha"], run)
+    return [Record.of(run).write(FOLDER) for run in newest.values()]
+
+
+FOLDER = tracking.RUNS / "reference" / "runs"

@@ -1,0 +1,126 @@
+"""What is published of a run, and the tables that are made of it alone."""
+
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from scipy import stats
+
+from conflow.experiment import compare, record, tracking
+from conflow.experiment.config import ConfigError, flatten, load
+from conflow.experiment.record import Record
+
+
+def published(ablation: str, seed: int, count: int, *arguments: str, preset: str = "quick") -> Record:
+    """A record in the current folder, with the same count of 1,000 trajectories in every setting."""
+    settings = load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
+    metrics: dict[str, float] = {}
+    for group in ("test/none", "test/robot", "test/obstacle", "evaluate/sample.solver:rk4/none"):
+        metrics |= {f"{group}/num": 1000, f"{group}/robot_collision_count": count, f"{group}/smoothness_median": 0.01}
+    flat = {key: str(value) for key, value in flatten(settings.tree()).items()}
+    made = Record(f"id-{seed}", ablation, preset, seed, flat, metrics, {"hardware": "a machine"}, 60.0)
+    made.write(record.FOLDER)
+    return made
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def cell(found: compare.Comparison, table: str, row: str, column: str) -> compare.Cell:
+    (one,) = [c for c in found.cells if (c.table, c.row, c.column) == (table, row, column)]
+    return one
+
+
+def test_a_record_survives_its_file() -> None:
+    made = published("cgp", 3, 20, "constraint.reduction=closest")
+    (path,) = record.FOLDER.iterdir()
+    assert path.name == "cgp-quick-constraint.reduction=closest-s3.json"
+    assert Record.read(path) == made
+
+
+def test_a_record_says_what_was_changed_and_nothing_else() -> None:
+    assert published("plus", 0, 1).changes() == []
+    assert published("cgp", 0, 1, "correction.lambda_c=10", "sample.num=100").changes() == [
+        "correction.lambda_c=10.0",
+        "sample.num=100",
+    ]
+
+
+def test_a_setting_that_came_later_counts_as_its_default() -> None:
+    made = published("cgp", 0, 1)
+    path = next(record.FOLDER.iterdir())
+    content = json.loads(path.read_text())
+    del content["settings"]["correction.edges"]
+    path.write_text(json.dumps(content))
+    assert Record.read(path).changes() == made.changes() == []
+
+
+def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
+    for seed in range(3):
+        published("cgp", seed, 300 + seed)
+        published("cgp", seed, 200 + seed, "constraint.reduction=closest")
+    found = compare.collect_reference()
+    plain = cell(found, "1", "ConFlow (D+ and D-)", "none: robot")
+    assert (plain.count, plain.trajectories, plain.seeds, plain.preset) == (903, 3000, 3, "quick")
+    reading = "ConFlow (D+ and D-), constraint.reduction=closest"
+    assert cell(found, "4", reading, "none: robot").count == 603
+    assert cell(found, "4", "default", "none: robot").count == 903
+    assert cell(found, "4", "ConFlow (D+ and D-), sample.solver:rk4", "none: robot").count == 903
+    assert found.commands[reading] == (
+        "make ablations ABLATIONS=cgp SEEDS=\"0 1 2\" PRESET=quick ARGS='constraint.reduction=closest'"
+    )
+
+
+def test_each_ablation_is_shown_at_its_largest_scale() -> None:
+    published("cgp", 0, 300)
+    published("cgp", 0, 16, preset="paper")
+    published("fm", 0, 31)
+    found = compare.collect_reference()
+    assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").preset == "paper"
+    assert cell(found, "1", "FM (D+)", "none: robot").preset == "quick"
+
+
+def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
+    published("cgp", 0, 300)
+    published("no_negatives", 0, 40)
+    found = compare.collect_reference()
+    assert cell(found, "1", "ConFlow (D+)", "none: robot").paper_p == pytest.approx(
+        stats.fisher_exact([[40, 960], [11, 245]]).pvalue
+    )
+    console = Console()
+    with console.capture() as captured:
+        compare.render(found, "markdown", console)
+    assert "paper 0.043, not distinguishable" in captured.get()
+    assert "paper 0.016, differs" in captured.get()
+
+
+def test_no_records_and_broken_ones_are_named() -> None:
+    with pytest.raises(ConfigError, match="expected records in"):
+        compare.collect_reference()
+    published("cgp", 0, 1)
+    (record.FOLDER / "broken.json").write_text("{")
+    with pytest.raises(ConfigError, match=r"broken\.json: expected the record of a run"):
+        compare.collect_reference()
+
+
+def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
+    store = tracking.client()
+    experiment = store.get_experiment_by_name("conflow")
+    assert experiment is not None
+    settings = load(["preset=smoke"])
+    tags = {"ablation": "cgp", "preset": "smoke", "seed": "0", "config_sha": settings.sha(), "git_sha": "abc"}
+    run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
+    for key, value in flatten(settings.tree()).items():
+        store.log_param(run_id, key, str(value))
+    store.log_metric(run_id, "test/none/num", 10)
+    store.log_metric(run_id, "train/loss", 0.1)
+    store.set_terminated(run_id, "FINISHED")
+    (path,) = record.publish("smoke")
+    made = Record.read(path)
+    assert (made.run_id, made.metrics, made.origin) == (run_id, {"test/none/num": 10}, {"git_sha": "abc"})
+    assert made.changes() == []
