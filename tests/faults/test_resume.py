@@ -141,3 +141,18 @@ def test_a_run_does_not_go_on_with_other_demonstrations(folder: Path, whole: Run
     code, output = processes.run(folder, *arguments, "resume=latest")
     assert code == 2
     assert "on which fm_mixed-s0 was trained" in output
+
+
+def test_the_papers_preset_survives_being_cut_into_pieces(tmp_path: Path) -> None:
+    """The preset itself, with its schedule, of a size that ends within the test."""
+    asked = (*TRAIN, "preset=paper", "network.hidden=32", "network.blocks=1")
+    code, output = processes.run(tmp_path, *asked)
+    assert code == 0, output
+    (whole,) = runs(tmp_path)
+    assert processes.run(tmp_path, *asked, death=killed_in(*STEP, call=26))[0] == -signal.SIGKILL
+    code, output = processes.run(tmp_path, *asked, "resume=latest")
+    assert code == 0, output
+    assert "from step 20 of 41" in output
+    resumed = runs(tmp_path)[0]
+    assert all(torch.equal(tensor, weights(whole)[name]) for name, tensor in weights(resumed).items())
+    assert history(tmp_path, resumed) == history(tmp_path, whole)
