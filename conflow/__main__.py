@@ -43,11 +43,11 @@ def ablations(arguments: list[str]) -> None:
     wanted = [f"preset={options['preset']}", *settings]
     config.check_training(config.load(wanted))
 
-    from conflow.experiment import compare, grid
+    from conflow.experiment import compare, grid, report
 
     console = _console()
     failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console)
-    compare.render(compare.collect(options["preset"], settings), "table", console)
+    report.render(compare.collect(options["preset"], settings), "table", console)
     if failed:
         raise config.ConfigError(f"{failed} cells failed; the same command tries them again")
 
@@ -66,15 +66,15 @@ def evaluate(arguments: list[str]) -> None:
 
 def compare(arguments: list[str]) -> None:
     """Print the paper's tables and claims from all finished runs of a preset, or, reference=1, those of record."""
-    from conflow.experiment import compare, config
+    from conflow.experiment import compare, config, report
 
     options, settings = config.options(arguments, {"preset": "quick", "format": "table", "reference": "0"})
     of_record = bool(config.whole(options, "reference", 0, 1))
     config.load([f"preset={options['preset']}", *settings])  # of a mistyped one there are no runs either
 
-    form = compare.checked_format(options["format"])
+    form = report.checked_format(options["format"])
     found = compare.collect_reference() if of_record else compare.collect(options["preset"], settings)
-    compare.render(found, form, _console())
+    report.render(found, form, _console())
 
 
 def reference(arguments: list[str]) -> None:

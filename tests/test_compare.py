@@ -9,7 +9,7 @@ from mlflow.entities import Metric
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import compare, config, tracking
+from conflow.experiment import compare, config, report, tracking
 from conflow.experiment.compare import COLLISIONS, GUARDS, QUALITIES, Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
@@ -113,9 +113,9 @@ def test_no_permutation_of_two_seeds_and_two_can_be_significant(
     assert (found.verdict, found.p) == ("not distinguishable", 2 / 6)
 
 
-def rendered(comparison: Comparison, form: compare.Format) -> str:
+def rendered(comparison: Comparison, form: report.Format) -> str:
     console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
-    compare.render(comparison, form, console)
+    report.render(comparison, form, console)
     return console.export_text()
 
 
@@ -128,7 +128,7 @@ def test_json_holds_everything_and_csv_every_cell(comparison: Comparison) -> Non
 
 
 @pytest.mark.parametrize("form", ["table", "markdown"])
-def test_a_rate_is_never_shown_without_interval_seeds_and_count(comparison: Comparison, form: compare.Format) -> None:
+def test_a_rate_is_never_shown_without_interval_seeds_and_count(comparison: Comparison, form: report.Format) -> None:
     text = rendered(comparison, form)
     low, high = wilson(86, 4000)
     for shown in (f"0.0215 [{low:.4f}, {high:.4f}]", "seeds 0.0200 to 0.0230", "paper 0.016", "4 seeds, 4000 traj"):
@@ -195,7 +195,7 @@ def test_a_claim_on_a_metric_that_a_run_lacks_says_so(patchy: Comparison) -> Non
 
 
 @pytest.mark.parametrize("form", ["table", "markdown", "csv", "json"])
-def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: compare.Format) -> None:
+def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: report.Format) -> None:
     text = rendered(patchy, form)
     if form == "markdown":
         _, table_3 = text.split("**Table 3")
@@ -209,9 +209,9 @@ def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: compa
         assert len(json.loads(text)["cells"]) == len(patchy.cells)
 
 
-@pytest.mark.parametrize("form", get_args(compare.Format))
-def test_without_a_single_cell_the_claims_are_left(comparison: Comparison, form: compare.Format) -> None:
-    text = rendered(replace(comparison, cells=[]), form)
+@pytest.mark.parametrize("form", get_args(report.Format))
+def test_without_a_single_cell_the_claims_are_left(comparison: Comparison, form: report.Format) -> None:
+    text = rendered(replace(comparison, cells=[], reasons={}), form)
     assert "table,row" in text if form == "csv" else "no finished run of plus" in text
     assert "Table" not in text
 

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import compare, record, tracking
+from conflow.experiment import compare, record, report, tracking
 from conflow.experiment.config import ConfigError, flatten, load
 from conflow.experiment.record import Record
 
@@ -94,7 +94,7 @@ def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
     )
     console = Console()
     with console.capture() as captured:
-        compare.render(found, "markdown", console)
+        report.render(found, "markdown", console)
     assert "paper 0.043, not distinguishable" in captured.get()
     assert "paper 0.016, differs" in captured.get()
 

@@ -1,16 +1,11 @@
 """The paper's tables and claims and tables of our own, filled from finished runs or from the records of them alone."""
 
-import csv
-import io
 import itertools
-import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Literal, cast, get_args
+from dataclasses import dataclass
+from typing import Literal
 
-from rich.console import Console
-from rich.table import Table
 from scipy import stats
 
 from conflow.experiment import record
@@ -18,7 +13,6 @@ from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
 from conflow.experiment.record import Record
 
-Format = Literal["table", "markdown", "csv", "json"]
 Verdict = Literal["holds", "reversed", "not distinguishable", "no runs"]
 LEVEL = 0.05
 """Claims are tested at this level, two-sided."""
@@ -171,18 +165,6 @@ class Comparison:
     reasons: dict[str, str]
 
 
-def checked_format(name: str) -> Format:
-    """The format of this name.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    for known in get_args(Format):
-        if name == known:
-            return cast(Format, known)
-    raise ConfigError(f"format={name}: expected one of {', '.join(get_args(Format))}")
-
-
 def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
     """Compare the newest finished run of every ablation and seed at a preset, with arguments as they were trained.
 
@@ -244,24 +226,6 @@ def _command(runs: Sequence[Record]) -> str:
     seeds, one = " ".join(str(of_seed.seed) for of_seed in runs), runs[0]
     arguments = f" ARGS='{' '.join(one.changes())}'" if one.changes() else ""
     return f'make ablations ABLATIONS={one.ablation} SEEDS="{seeds}" PRESET={one.preset}{arguments}'
-
-
-def render(comparison: Comparison, form: Format, console: Console) -> None:
-    """Print a comparison as a table, Markdown, CSV (the cells) or JSON (everything)."""
-    if form == "json":
-        console.out(json.dumps(asdict(comparison), indent=1), highlight=False)
-    elif form == "csv":
-        text = io.StringIO()
-        writer = csv.DictWriter(text, [field.name for field in fields(Cell)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(cell) for cell in comparison.cells)
-        console.out(text.getvalue(), end="", highlight=False)
-    else:
-        for title, header, rows in _sheets(comparison):
-            if form == "markdown":
-                console.out(_markdown(title, header, rows), highlight=False)
-            else:
-                console.print(_table(title, header, rows))
 
 
 def _table_1(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
@@ -415,74 +379,3 @@ def _permutation(metric: str, lower: Sequence[Record], higher: Sequence[Record])
         differences.append(abs(first / len(values[0]) - (sum(pooled) - first) / len(values[1])))
     # Relative slack: the observed split must count as itself, whatever the order of summation.
     return a, b, sum(d >= observed * (1 - 1e-9) for d in differences) / len(differences)
-
-
-def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Title, header and rows of the tables and of the claims, as text."""
-    preset = comparison.preset
-    tables = {
-        "1": (f"Table 1: collision rates, preset {preset} (setting: what is hit)", COLLISIONS),
-        "2": (f"Table 2: sources, without guidance, preset {preset}", QUALITIES | SMOOTHNESS),
-        "3": (f"Table 3: quality without guidance, preset {preset}", GUARDS),
-        "4": (f"Table 4: what the paper leaves open, changed one at a time, preset {preset}", READINGS),
-    }
-    sheets = []
-    for table, (title, metrics) in tables.items():
-        cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == table}
-        columns = _ordered((column for _, column in cells), metrics.values())
-        rows = []
-        for row in _ordered((row for row, _ in cells), metrics.values()):
-            of_row = [cells.get((row, column)) for column in columns]
-            known = next(cell for cell in of_row if cell is not None)
-            size = (
-                f"{known.preset}, {known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
-            )
-            rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row)])
-        if cells:
-            sheets.append((title, ["", *columns], rows))
-    claims = [
-        [claim.text, claim.verdict, "" if claim.p is None else f"p = {claim.p:.2g}", claim.detail]
-        for claim in comparison.claims
-    ]
-    sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
-    if comparison.reasons:
-        differing = [list(pair) for pair in comparison.reasons.items()]
-        sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
-    again = [list(pair) for pair in comparison.commands.items()]
-    sheets.append((f"The runs of a row again (read as {comparison.reading})", ["row", "command"], again))
-    return sheets
-
-
-def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
-    """Each name once, metrics in their order even where the first of the runs lacks one."""
-    rank = {metric: i for i, metric in enumerate(metrics)}
-    return sorted(dict.fromkeys(names), key=lambda name: rank.get(name, 0))
-
-
-def _text(cell: Cell) -> str:
-    parts = [f"{cell.value:.4f}"]
-    if cell.low is not None:
-        parts[0] += f" [{cell.low:.4f}, {cell.high:.4f}]"
-    if cell.count is not None:
-        parts.append(f"{cell.count} of {cell.trajectories}")
-    if cell.seeds > 1:
-        parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
-    if cell.paper is not None:
-        agrees = "" if cell.paper_p is None else ", differs" if cell.paper_p < LEVEL else ", not distinguishable"
-        parts.append(f"paper {cell.paper:.4g}{agrees}")
-    return "\n".join(parts)
-
-
-def _table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(title=title, show_lines=True)
-    for name in header:
-        table.add_column(name)
-    for row in rows:
-        table.add_row(*(text.replace("[", "\\[") for text in row))
-    return table
-
-
-def _markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [f"**{title}**", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    lines += ["| " + " | ".join(text.replace("\n", "<br>") for text in row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"

@@ -1,9 +1,21 @@
-"""Tables of results."""
+"""Tables of results: of one run, and the comparison of many as a table, Markdown, CSV or JSON."""
 
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, fields
+from typing import Literal, cast, get_args
+
+from rich.console import Console
 from rich.table import Table
 
+from conflow.experiment.compare import COLLISIONS, GUARDS, LEVEL, QUALITIES, READINGS, SMOOTHNESS, Cell, Comparison
+from conflow.experiment.config import ConfigError
 from conflow.experiment.evaluation import Metrics
 from conflow.experiment.module import Setting
+
+Format = Literal["table", "markdown", "csv", "json"]
 
 ROWS = {
     "robot_collision_rate": "robot-collision rate",
@@ -39,3 +51,104 @@ def _estimate(metrics: Metrics, key: str) -> str:
         return ""
     stem = key.removesuffix("_rate")
     return f"{metrics[key]:.4f}\n[dim]\\[{metrics[f'{stem}_low']:.4f}, {metrics[f'{stem}_high']:.4f}][/dim]"
+
+
+def checked_format(name: str) -> Format:
+    """The format of this name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for known in get_args(Format):
+        if name == known:
+            return cast(Format, known)
+    raise ConfigError(f"format={name}: expected one of {', '.join(get_args(Format))}")
+
+
+def render(comparison: Comparison, form: Format, console: Console) -> None:
+    """Print a comparison as a table, Markdown, CSV (the cells) or JSON (everything)."""
+    if form == "json":
+        console.out(json.dumps(asdict(comparison), indent=1), highlight=False)
+    elif form == "csv":
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [field.name for field in fields(Cell)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(cell) for cell in comparison.cells)
+        console.out(text.getvalue(), end="", highlight=False)
+    else:
+        for title, header, rows in _sheets(comparison):
+            if form == "markdown":
+                console.out(_markdown(title, header, rows), highlight=False)
+            else:
+                console.print(_table(title, header, rows))
+
+
+def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, header and rows of the tables and of the claims, as text."""
+    preset = comparison.preset
+    tables = {
+        "1": (f"Table 1: collision rates, preset {preset} (setting: what is hit)", COLLISIONS),
+        "2": (f"Table 2: sources, without guidance, preset {preset}", QUALITIES | SMOOTHNESS),
+        "3": (f"Table 3: quality without guidance, preset {preset}", GUARDS),
+        "4": (f"Table 4: what the paper leaves open, changed one at a time, preset {preset}", READINGS),
+    }
+    sheets = []
+    for table, (title, metrics) in tables.items():
+        cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == table}
+        columns = _ordered((column for _, column in cells), metrics.values())
+        rows = []
+        for row in _ordered((row for row, _ in cells), metrics.values()):
+            of_row = [cells.get((row, column)) for column in columns]
+            known = next(cell for cell in of_row if cell is not None)
+            size = (
+                f"{known.preset}, {known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
+            )
+            rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row)])
+        if cells:
+            sheets.append((title, ["", *columns], rows))
+    claims = [
+        [claim.text, claim.verdict, "" if claim.p is None else f"p = {claim.p:.2g}", claim.detail]
+        for claim in comparison.claims
+    ]
+    sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
+    if comparison.reasons:
+        differing = [list(pair) for pair in comparison.reasons.items()]
+        sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
+    again = [list(pair) for pair in comparison.commands.items()]
+    sheets.append((f"The runs of a row again (read as {comparison.reading})", ["row", "command"], again))
+    return sheets
+
+
+def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
+    """Each name once, metrics in their order even where the first of the runs lacks one."""
+    rank = {metric: i for i, metric in enumerate(metrics)}
+    return sorted(dict.fromkeys(names), key=lambda name: rank.get(name, 0))
+
+
+def _text(cell: Cell) -> str:
+    parts = [f"{cell.value:.4f}"]
+    if cell.low is not None:
+        parts[0] += f" [{cell.low:.4f}, {cell.high:.4f}]"
+    if cell.count is not None:
+        parts.append(f"{cell.count} of {cell.trajectories}")
+    if cell.seeds > 1:
+        parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
+    if cell.paper is not None:
+        agrees = "" if cell.paper_p is None else ", differs" if cell.paper_p < LEVEL else ", not distinguishable"
+        parts.append(f"paper {cell.paper:.4g}{agrees}")
+    return "\n".join(parts)
+
+
+def _table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(title=title, show_lines=True)
+    for name in header:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*(text.replace("[", "\\[") for text in row))
+    return table
+
+
+def _markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"**{title}**", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(text.replace("\n", "<br>") for text in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
