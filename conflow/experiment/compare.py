@@ -206,7 +206,7 @@ def _reading(one: Record) -> str:
 
 
 def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> Comparison:
-    cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *(_table_4(runs, readings) if readings else [])]
+    cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *_table_4(runs, readings)]
     settings = next(iter(runs.get("cgp") or next(iter(runs.values())))).settings
     differing = {cell.row for cell in cells if cell is not None and cell.paper_p is not None and cell.paper_p < LEVEL}
     named = {METHODS.get(ablation, ablation): of_row for ablation, of_row in runs.items()} | dict(readings)
@@ -263,6 +263,8 @@ def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Recor
     for name, of_row in runs.items():
         labels = sorted({key.split("/")[1] for one in of_row for key in one.metrics if key.startswith("evaluate/")})
         rows += [(f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", of_row) for label in labels]
+    if len(rows) == 1:
+        return []
     return [
         _cell("4", row, column, None, prefix + metric, of_row)
         for row, prefix, of_row in rows

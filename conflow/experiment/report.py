@@ -106,17 +106,20 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
             rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row)])
         if cells:
             sheets.append((title, ["", *columns], rows))
-    claims = [
-        [claim.text, claim.verdict, "" if claim.p is None else f"p = {claim.p:.2g}", claim.detail]
-        for claim in comparison.claims
-    ]
+    claims = [[claim.text, claim.verdict, _p(claim.p), claim.detail] for claim in comparison.claims]
     sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
     if comparison.reasons:
         differing = [list(pair) for pair in comparison.reasons.items()]
         sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
-    again = [list(pair) for pair in comparison.commands.items()]
-    sheets.append((f"The runs of a row again (read as {comparison.reading})", ["row", "command"], again))
+    again = [["all, unless they say otherwise, read as", comparison.reading], *map(list, comparison.commands.items())]
+    sheets.append(("The runs of a row again", ["row", "command"], again))
     return sheets
+
+
+def _p(p: float | None) -> str:
+    if p is None:
+        return ""
+    return f"p = {p:.2g}" if p > 0 else "p < 1e-300"
 
 
 def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
