@@ -127,19 +127,23 @@ def load(path: Path) -> dict[str, Any]:
     return dict(checkpoint)
 
 
-def newest(folder: Path) -> tuple[Path | None, list[str]]:
-    """The newest complete checkpoint of training in a folder, if there is one, and what is wrong with newer ones."""
+def newest(folder: Path) -> tuple[Path | None, int, list[str]]:
+    """The newest complete checkpoint of training in a folder, its step, and what is wrong with newer ones.
+
+    None and step 0 where there is none.
+    """
     refused: list[str] = []
     for path in (folder / LAST, folder / PREVIOUS):
         try:
-            if "loops" in load(path):
-                return path, refused
+            checkpoint = load(path)
+            if "loops" in checkpoint:
+                return path, checkpoint["global_step"], refused
             refused.append(f"{path}: expected the state of a training, found a model alone")
         except FileNotFoundError:
             pass
         except CheckpointError as error:
             refused.append(str(error))
-    return None, refused
+    return None, 0, refused
 
 
 def _sync(folder: Path) -> None:

@@ -140,6 +140,10 @@ class ConFlow(LightningModule):
                 f"and step {step}, train.lr={self.config.train.lr:g}"
             )
 
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        # Another number of threads adds up in another order, and bits differ.
+        torch.set_num_threads(checkpoint["conflow"]["threads"])
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         described = {"config": self.config.tree(), "T": self.T, "D": self.D, "threads": torch.get_num_threads()}
         checkpoint["conflow"] = described

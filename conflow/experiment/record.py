@@ -11,6 +11,7 @@ from mlflow.entities import Run
 from conflow.experiment import config, tracking
 from conflow.experiment.config import ConfigError, flatten
 
+FOLDER = tracking.RUNS / "reference" / "runs"
 PUBLISHED = ("test/", "without_model/", "source/", "evaluate/")
 ORIGIN = ("git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
 
@@ -73,10 +74,6 @@ class Record:
         named = flatten(config.load([f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]).tree())
         return [f"{key}={value}" for key, value in self.settings.items() if value != str(named.get(key, value))]
 
-    def same_but_for_seed(self) -> tuple[str, ...]:
-        """What its runs of other seeds have in common with it."""
-        return (self.ablation, self.preset, *self.changes())
-
 
 def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
     """The newest finished run of every ablation and seed at a preset, with arguments as they were trained."""
@@ -109,6 +106,3 @@ def publish(preset: str) -> list[Path]:
     for run in tracking.runs("FINISHED", preset=preset):
         newest.setdefault(run.data.tags["config_sha"], run)
     return [Record.of(run).write(FOLDER) for run in newest.values()]
-
-
-FOLDER = tracking.RUNS / "reference" / "runs"

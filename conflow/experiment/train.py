@@ -7,7 +7,6 @@ import warnings
 from pathlib import Path
 
 import lightning
-import torch
 from lightning import Trainer
 from mlflow.entities import Run
 from rich.console import Console
@@ -77,15 +76,9 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
 def _continued(run: Run, config: Config, data: DemonstrationData, console: Console) -> Path | None:
     """The checkpoint from which a run goes on, or None from its beginning."""
     resume.check(run, config, data)
-    path, refused = checkpoints.newest(tracking.checkpoints(str(run.info.run_id)))
+    path, step, refused = checkpoints.newest(tracking.checkpoints(str(run.info.run_id)))
     for reason in refused:
         console.print(f"{reason}; going on from the one before it", highlight=False, soft_wrap=True)
-    step = 0
-    if path is not None:
-        state = checkpoints.load(path)
-        step = state["global_step"]
-        # Another number of threads adds up in another order, and bits differ.
-        torch.set_num_threads(state["conflow"]["threads"])
     console.print(
         f"Going on with run {run.info.run_name} from step {step} of {config.train.max_steps}", highlight=False
     )
@@ -93,10 +86,10 @@ def _continued(run: Run, config: Config, data: DemonstrationData, console: Conso
 
 
 def _last_good(run_id: str) -> str:
-    path, _ = checkpoints.newest(tracking.checkpoints(run_id))
+    path, step, _ = checkpoints.newest(tracking.checkpoints(run_id))
     if path is None:
         return "there is no checkpoint from before"
-    return f"the last good checkpoint is {path}, of step {checkpoints.load(path)['global_step']}"
+    return f"the last good checkpoint is {path}, of step {step}"
 
 
 def _quiet() -> None:

@@ -134,6 +134,6 @@ def test_loading_a_checkpoint_runs_no_code_from_it(tmp_path: Path) -> None:
 
 def test_a_model_alone_is_no_state_to_go_on_from(tmp_path: Path) -> None:
     AtomicCheckpointIO().save_checkpoint({"conflow": {}}, tmp_path / checkpoints.LAST)
-    path, refused = checkpoints.newest(tmp_path)
+    path, _, refused = checkpoints.newest(tmp_path)
     assert path is None
     assert "found a model alone" in refused[0]
