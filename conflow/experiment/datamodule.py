@@ -51,11 +51,14 @@ class Batches:
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         x, violates = self.split
         for step in range(self.step, self.steps):
-            noise = random_stream("batch", self.seed, step)
-            drawn = [
-                part[torch.randint(len(part), (count,), generator=noise).to(x.device)] for part, count in self.parts
-            ]
-            i = torch.cat(drawn)
+            # Drawn where the data are: a copy from the host at every step would make an accelerator wait.
+            noise = random_stream("batch", self.seed, step, device=x.device)
+            i = torch.cat(
+                [
+                    part[torch.randint(len(part), (count,), generator=noise, device=x.device)]
+                    for part, count in self.parts
+                ]
+            )
             self.step = step + 1
             yield x[i], violates[i]
 

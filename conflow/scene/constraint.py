@@ -18,6 +18,8 @@ from conflow.scene.robots import PointRobots
 
 BarrierShape = Literal["softplus", "relu"]
 Reduction = Literal["sum", "mean", "closest"]
+SHARED = 1e-12
+"""Two bodies that are nearer share a point."""
 
 
 @dataclass(frozen=True)
@@ -127,11 +129,11 @@ class Avoidance(Constraint):
         self.register_buffer("radius", radius, persistent=False)
 
     def clearance(self, x: Tensor) -> Tensor:
-        return self._pairs(x)[1].amin(dim=2)
+        return self._pairs(x)[2].amin(dim=2)
 
     def swept_clearance(self, x: Tensor) -> Tensor:
         # The separation goes straight too, w(tau) = w + tau u, and is shortest at tau = -<w, u> / |u|^2.
-        w, c = self._pairs(x)
+        w, _, c = self._pairs(x)
         u = w.diff(dim=1)
         w = w[:, :-1]
         length = (u * u).sum(dim=3).clamp_min(torch.finfo(u.dtype).tiny)  # of bodies that keep their separation: 0
@@ -141,23 +143,24 @@ class Avoidance(Constraint):
         return torch.minimum(nearest, torch.minimum(c[:, :-1], c[:, 1:])).amin(dim=2)
 
     def barrier(self, x: Tensor) -> Tensor:
-        return self._weight(x) * self.shape.value(self._candidates(self._pairs(x)[1]).min(dim=2).values).sum(dim=1)
+        return self._weight(x) * self.shape.value(self._candidates(self._pairs(x)[2]).min(dim=2).values).sum(dim=1)
 
     def gradient(self, x: Tensor) -> Tensor:
-        w, c = self._pairs(x)
+        w, d, c = self._pairs(x)
         candidates = self._candidates(c)
         nearest = candidates.min(dim=2, keepdim=True)
         slope = self._weight(x) * self.shape.slope(nearest.values)
         dC_dc = torch.zeros_like(candidates).scatter(2, nearest.indices, slope).view_as(c)
-        # d|w|/dw = w / |w|; where two bodies share a point there is none, and normalize gives the subgradient 0.
-        dC_dw = dC_dc[..., None] * F.normalize(w, dim=3)
-        return self.robots.pullback(torch.einsum("pn,btpk->btnk", self.incidence.to(w.dtype), dC_dw))
+        # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
+        dC_dw = (dC_dc / d.clamp_min(SHARED))[..., None] * w
+        return self.robots.pullback(self.incidence.to(w.dtype).mT @ dC_dw)
 
-    def _pairs(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Separations (batch, T, pairs, 2) and clearances (batch, T, pairs)."""
+    def _pairs(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Separations w (batch, T, pairs, 2), distances d = |w| and clearances c = d - r, both (batch, T, pairs)."""
         p = self.robots.points(x).flatten(2, 3)
         w = torch.einsum("pn,btnk->btpk", self.incidence.to(x.dtype), p) - self.offset
-        return w, torch.linalg.vector_norm(w, dim=3) - self.radius
+        d = torch.linalg.vector_norm(w, dim=3)
+        return w, d, d - self.radius
 
     def _weight(self, x: Tensor) -> float:
         """What C at one waypoint counts for in C of the trajectory."""
