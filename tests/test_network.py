@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from conflow.flow.network import ResidualBlock, ResMLP, SpectralMLP
+from conflow.flow.network import SEEN, ResidualBlock, ResMLP, SpectralMLP
 from conflow.flow.sampler import integrate
 from conflow.flow.source import ENDPOINTS, Source, rbf
 from conflow.scene.constraint import RobotAvoidance
@@ -106,6 +106,21 @@ def test_an_untrained_spectral_network_is_the_flow_between_two_gaussians() -> No
     x_1 = integrate(v, x_0, steps=400, solver="rk4")
     # Of a step of 1/400 the fourth-order error is below float32's rounding, some 1e-6 over 400 steps.
     torch.testing.assert_close(v.coordinates(x_1), factor * v.coordinates(x_0), rtol=1e-3, atol=1e-4)
+
+
+def test_far_off_what_training_shows_only_the_closed_form_acts() -> None:
+    """Beyond +-SEEN the network is blind: v differs by E a z alone, which in a narrow mode leads straight back."""
+    v, source = spectral()
+    v.variance = 1e-4 * v.source_variance  # the demonstrations are much narrower
+    x = torch.tensor([0.0, 1, 0, -1]).expand(1, 32, 4)  # so far apart that neither clearance nor gradient tells
+    t = torch.tensor([0.5])
+    trailing = source.modes[:, -1:].float() * torch.tensor([0.0, 1, 0, 1])
+    sigma_t = (0.25 * (v.variance + v.source_variance))[-1, 0].sqrt()
+    near, far = (v(x + deviations * sigma_t * trailing, t) for deviations in (2 * SEEN, 5 * SEEN))
+    # a = -1 / (1 - t) but for the demonstrations' own width.
+    torch.testing.assert_close(far - near, -2 * 3 * SEEN * sigma_t * trailing[None], rtol=1e-3, atol=1e-6)
+    seen = v(x + SEEN / 2 * sigma_t * trailing, t) - v(x, t)
+    assert not torch.allclose(seen, -SEEN * sigma_t * trailing[None], rtol=1e-3, atol=1e-6)
 
 
 def test_the_variance_of_the_demonstrations_is_kept_in_a_checkpoint() -> None:

@@ -61,7 +61,7 @@ def test_a_run_is_finished_named_tagged_and_has_every_setting(trained: tuple[Run
 
 def test_a_run_holds_the_documented_metrics(trained: tuple[Run, str]) -> None:
     run, _ = trained
-    expected = {"train/loss", "train/grad_norm", "train/steps_per_second", "val/loss"}
+    expected = {"train/loss", "train/grad_norm", "train/steps_per_second", "train/seconds", "val/loss"}
     for setting in SETTINGS:
         for metric in ("robot_collision", "object_collision", "robot_collision_swept", "success", "outside"):
             expected |= {f"test/{setting}/{metric}_{part}" for part in ("rate", "low", "high", "count")}

@@ -18,26 +18,38 @@ VALIDATION_SAMPLES = 256
 
 
 class TrainingLog(Callback):
-    """train/loss, train/grad_norm and train/steps_per_second, every `log_every` steps.
+    """train/loss, train/grad_norm, train/steps_per_second and train/seconds, every `log_every` steps.
 
     Between two points nothing is read from the device, so the loop never waits for a number. What has been summed up
-    since the last one is part of a checkpoint.
+    since the last one is part of a checkpoint. The seconds are those of training alone: during a validation and the
+    checkpoint after it the clock stands still.
     """
 
     def __init__(self, log_every: int) -> None:
         self.log_every = log_every
         self.summed, self.loss = 0, torch.zeros(())
         self.since = 0, 0.0
+        self.seconds = 0.0
+        self.ticking: float | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return {"summed": self.summed, "loss": self.loss}
+        return {"summed": self.summed, "loss": self.loss, "seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.summed, self.loss = state_dict["summed"], state_dict["loss"]
+        self.summed, self.loss, self.seconds = (state_dict[key] for key in ("summed", "loss", "seconds"))
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
-        self.since = trainer.global_step, time.monotonic()
+        self.since = trainer.global_step, self.seconds
         self.loss = self.loss.to(pl_module.device)
+        self._tick()
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
+        if self.ticking is None:
+            self._tick()
+
+    def on_validation_start(self, trainer: Trainer, pl_module: Any) -> None:
+        self._tick()
+        self.ticking = None
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         self.loss += outputs["loss"]
@@ -46,15 +58,22 @@ class TrainingLog(Callback):
         if (step % self.log_every and step != trainer.max_steps) or trainer.logger is None:
             return
         pl_module.check_finite("the loss", self.loss, batch_idx)
-        now = time.monotonic()
+        self._tick()
         metrics = {
             "train/loss": float(self.loss) / self.summed,
             "train/grad_norm": float(pl_module.grad_norm),
-            "train/steps_per_second": (step - last) / (now - then),
+            "train/steps_per_second": (step - last) / (self.seconds - then),
+            "train/seconds": self.seconds,
         }
         trainer.logger.log_metrics(metrics, step)
         self.loss.zero_()
-        self.summed, self.since = 0, (step, now)
+        self.summed, self.since = 0, (step, self.seconds)
+
+    def _tick(self) -> None:
+        """Add what has passed since the last tick."""
+        now = time.monotonic()
+        self.seconds += 0.0 if self.ticking is None else now - self.ticking
+        self.ticking = now
 
 
 class TrainingProgress(Callback):

@@ -50,16 +50,16 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
             kernel = model.config.source
             logger.log_metrics({"source/length_scale": kernel.length_scale, "source/sigma_f": kernel.sigma_f}, 0)
         with ProgressDisplay(console) as display:
-            trainer = _trainer(config, logger, data, display)
+            loop = trainer(config, logger, data, display)
             try:
-                trainer.fit(model, data, ckpt_path=checkpoint)
+                loop.fit(model, data, ckpt_path=checkpoint)
             except DivergedError as error:
                 raise DivergedError(f"{error}; {_last_good(run_id)}") from None
             evaluation = evaluate(model.eval(), data.test.x, display)
         # One value a run: at step 0 MLflow draws bars that compare runs, at any other a line of one point.
         logger.log_metrics(evaluation.keyed(), 0)
         with tempfile.TemporaryDirectory() as folder:
-            trainer.save_checkpoint(Path(folder, MODEL_FILE), weights_only=True)
+            loop.save_checkpoint(Path(folder, MODEL_FILE), weights_only=True)
             pictures = {
                 "page": figures.page(model, data, evaluation),
                 "demonstrations": figures.demonstrations(data),
@@ -99,7 +99,8 @@ def _quiet() -> None:
         warnings.filterwarnings("ignore", message)
 
 
-def _trainer(config: Config, logger: tracking.RunLogger, data: DemonstrationData, display: ProgressDisplay) -> Trainer:
+def trainer(config: Config, logger: tracking.RunLogger, data: DemonstrationData, display: ProgressDisplay) -> Trainer:
+    """The training loop of an experiment."""
     interval = min(config.train.val_every, config.train.max_steps)
     return Trainer(
         accelerator="auto",

@@ -6,6 +6,9 @@ from torch import Tensor, nn
 from conflow.flow.correction import Differentiable
 from conflow.flow.source import Source
 
+SEEN = 4.0
+"""Standard deviations beyond which there is next to nothing to learn from."""
+
 
 class ResidualBlock(nn.Module):
     """h + W_2 silu(W_1 h)."""
@@ -56,6 +59,8 @@ class SpectralMLP(nn.Module):
     smooth as the modes are, and stays where the source is conditioned to the last bit.
 
     h_theta sees z / sigma_t, the conditioned values x_O, Fourier features of t, clearances, and grad C in the modes.
+    Of z / sigma_t it sees no more than +-SEEN: where a correction has pushed x out of all that training shows, in a
+    mode that is narrow, h_theta is not asked for what it never learned, and a z alone leads back.
 
     Args:
         source: its modes, usually a few leading ones.
@@ -113,7 +118,7 @@ class SpectralMLP(nn.Module):
         sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
         a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2
         c = (self.source_variance * self.variance).sqrt() / sigma_t
-        h = self.outlet(self.blocks(self.inlet(self._features(x, z / sigma_t, t))))
+        h = self.outlet(self.blocks(self.inlet(self._features(x, (z / sigma_t).clamp(-SEEN, SEEN), t))))
         return self.modes @ (a * z + c * h.view_as(z))
 
     def _features(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:

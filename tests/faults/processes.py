@@ -108,7 +108,7 @@ def history(folder: Path, run: Run) -> dict[str, list[tuple[int, float]]]:
     return {
         key: sorted((point.step, point.value) for point in store(folder).get_metric_history(run.info.run_id, key))
         for key in run.data.metrics
-        if not key.endswith(("steps_per_second", "latency_ms"))
+        if not key.endswith(("steps_per_second", "train/seconds", "latency_ms"))
     }
 
 
