@@ -13,9 +13,10 @@ from rich.console import Console
 
 from conflow.experiment import config
 from conflow.experiment.build import build_source, robot_avoidance
+from conflow.experiment.closed_form import expected, minimiser, posterior
 from conflow.experiment.config import Config
 from conflow.experiment.figures import explain
-from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations, expected, posterior
+from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations
 from conflow.experiment.figures.front import front
 from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter
@@ -46,6 +47,53 @@ def check_labels(figure: Figure) -> None:
         assert axis.get_ylabel()
         assert axis.get_xlabel() or axis.get_label() == "<colorbar>"
     assert figure.get_suptitle()
+
+
+def test_the_minimiser_leaves_a_residual_that_no_function_of_x_t_explains(settings: Config) -> None:
+    """The normal equations of least squares: E <phi(x_t), u_t + lambda M u^c(x_t) - v(x_t, t)> = 0 for every phi."""
+    nominal = config.load(["data.num=300", "data.jitter=0"])
+    x_1 = demonstrations(nominal).double()
+    p_0, constraint = build_source(nominal.source, 32), robot_avoidance(nominal, 4)
+    M, u_c, t = constraint.violation(x_1), Correction(constraint, gaussian_filter(32)), 0.4
+    v = minimiser(p_0, x_1, M, u_c, 2.5)
+    i = torch.randint(300, (4000,), generator=torch.Generator().manual_seed(0))
+    z = torch.randn(4000, 30, 4, generator=torch.Generator().manual_seed(1)).double()
+    x_0 = p_0.mean(p_0.observe(x_1[i])) + p_0.modes * p_0.variance.sqrt() @ z
+    x_t = (1 - t) * x_0 + t * x_1[i]
+    push = u_c(x_t.float()).double()
+    found = v(x_t, torch.full((len(i),), t))
+    residual = x_1[i] - x_0 + 2.5 * M[i][:, None, None] * push - found
+    for phi in (x_t, found, push, x_t.square()):
+        products = (phi * residual).sum(dim=(1, 2))
+        assert abs(products.mean()) < 4 * products.std() / len(i) ** 0.5  # four standard errors, seeds fixed
+    # With half of the correction the same would fail.
+    products = (push * (residual + 1.25 * M.double().mean() * push)).sum(dim=(1, 2))
+    assert products.mean() > 4 * products.std() / len(i) ** 0.5
+
+
+def test_the_minimiser_without_correction_gives_the_demonstrations_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    nominal = config.load(["data.num=200", "data.jitter=0"])
+    x_1 = demonstrations(nominal)
+    p_0, constraint = build_source(nominal.source, 32), robot_avoidance(nominal, 4)
+    M, u_c = constraint.violation(x_1), Correction(constraint, gaussian_filter(32))
+    monkeypatch.setattr(explain, "SAMPLES", 400)
+    monkeypatch.setattr(explain, "SAMPLE_STEPS", 25)
+    end = explain.sampled(p_0, x_1, minimiser(p_0, x_1, M, u_c, 0.0))[-1]
+    nearest = torch.cdist(end.flatten(1), x_1.double().flatten(1)).amin(dim=1)
+    assert nearest.median() < 1e-3
+    # As often as they collide: a binomial of 400 has a standard deviation of 0.023.
+    assert abs(constraint.violation(end).double().mean() - M.double().mean()) < 0.09
+
+
+def test_the_papers_loss_minimised_exactly_avoids_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"PAIRS": 400, "SAMPLES": 100, "SAMPLE_STEPS": 40, "WEIGHTS": (0.0, 2.5)}.items():
+        monkeypatch.setattr(explain, name, value)
+    figure = explain.exact(config.load())
+    rates, astray = figure.axes
+    assert curve(rates, explain.PAPERS)[0] > 0.2
+    assert curve(rates, explain.PAPERS)[1] < 0.08
+    assert curve(astray, explain.PAPERS)[-1] < 0.2
+    check_labels(figure)
 
 
 @pytest.mark.parametrize("t", [0.0, 0.3, 0.8])
@@ -197,7 +245,7 @@ def test_the_picture_of_lambda(settings: Config, monkeypatch: pytest.MonkeyPatch
 def test_every_picture_is_written_and_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line a picture: its file and what it finds; drawn again, it is overwritten."""
     monkeypatch.chdir(tmp_path)
-    names = ["gap", "support", "eigenvalues", "predicted_end", "lambda_scale"]
+    names = ["gap", "support", "exact", "eigenvalues", "predicted_end", "lambda_scale"]
 
     def picture(settings: Config) -> Figure:
         figure = Figure(figsize=(1, 1))

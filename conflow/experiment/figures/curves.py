@@ -33,7 +33,7 @@ def guidance_weight(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> 
         # A config that does not guide is shown about the weight 1.
         weights = [factor * (configured or 1.0) for factor in FACTORS]
         counts = collisions_by_weight(model, setting, x_0, weights, ends)
-        _rate(axis, weights, counts, len(x_0), COLOURS[setting], name)
+        rate(axis, weights, counts, len(x_0), COLOURS[setting], name)
         axis.set_xscale("symlog", linthresh=weights[1])
         axis.set_xticks(weights, [f"{weight:g}" for weight in weights])
         axis.set_xticks([], minor=True)
@@ -51,7 +51,7 @@ def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Fig
     for solver, colour in SOLVERS.items():
         solved = by_evaluations(model, solver, x_0, BUDGETS, ends)
         evaluations = [one.evaluations for one in solved]
-        _rate(rates, evaluations, [one.collisions for one in solved], len(x_0), colour, solver)
+        rate(rates, evaluations, [one.collisions for one in solved], len(x_0), colour, solver)
         _median(smooth, solved, colour, solver)
     rates.set(ylabel="robot-collision rate", title=f"no guidance, {len(x_0)} trajectories\nband: 95 % Wilson")
     smooth.set(ylabel="smoothness (workspace units)", title="median second difference\nband: 95 % of order statistics")
@@ -89,7 +89,7 @@ def guidance(settings: Mapping[Setting, Guidance]) -> Figure:
     return figure
 
 
-def _rate(axis: Axes, x: Sequence[float], counts: Sequence[int], total: int, colour: str, label: str) -> None:
+def rate(axis: Axes, x: Sequence[float], counts: Sequence[int], total: int, colour: str, label: str) -> None:
     """A rate along x with its band of Wilson's intervals."""
     low, high = zip(*(wilson(count, total) for count in counts), strict=True)
     axis.fill_between(x, low, high, color=colour, alpha=0.25, lw=0)

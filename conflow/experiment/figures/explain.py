@@ -1,8 +1,4 @@
-"""Why the covariant correction works: closed forms beside the numbers, from the project's own parts and without a run.
-
-The marginal velocity of flow matching over finitely many demonstrations has a closed form, so that nothing here is
-trained: given x_t, each demonstration has a posterior weight, and every expectation is a weighted mean.
-"""
+"""Why the corrections work or do not: closed forms beside the numbers, from our own parts and without a run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -17,11 +13,11 @@ from torch import Tensor
 
 from conflow.experiment import config, tracking
 from conflow.experiment.build import build_source, fitted, random_stream, robot_avoidance
+from conflow.experiment.closed_form import Way, coordinates, expected, minimiser, posterior, whitened
 from conflow.experiment.config import Config
-from conflow.experiment.figures.curves import MARK
+from conflow.experiment.figures.curves import MARK, rate
 from conflow.experiment.figures.workspace import COLLISION, ROBOTS, save
 from conflow.flow.correction import Correction, covariant, gaussian_filter
-from conflow.flow.path import interpolate
 from conflow.flow.sampler import Field, states
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint
@@ -40,6 +36,9 @@ HORIZONS = (16, 24, 32, 48, 64, 96, 128)
 LENGTH_SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)
 CLEARED = 0.9
 SHAPES = 5
+SAMPLES, SAMPLE_STEPS = 512, 100
+WEIGHTS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0)
+PAPERS, PAPER_RATE = "filter, the paper's", 0.016
 
 
 def draw(settings: Config, console: Console) -> None:
@@ -48,6 +47,7 @@ def draw(settings: Config, console: Console) -> None:
     pictures: dict[str, Callable[[Config], Figure]] = {
         "gap": gap,
         "support": support,
+        "exact": exact,
         "eigenvalues": eigenvalues,
         "predicted_end": predicted_end,
         "lambda_scale": lambda_scale,
@@ -171,6 +171,58 @@ def in_deviations(source: Source, u: Tensor) -> Tensor:
     return source.modes.mT @ u / source.variance.sqrt()[:, None]
 
 
+def exact(settings: Config) -> Figure:
+    """What the paper's loss asks for: collisions after the flow of its exact minimiser, and how far x_t goes astray."""
+    # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
+    nominal = replace(settings, data=replace(settings.data, jitter=0))
+    x_1, lambda_c = demonstrations(nominal)[:PAIRS], nominal.correction.lambda_c
+    source, constraint = build_source(nominal.source, x_1.shape[1]), robot_avoidance(nominal, x_1.shape[2])
+    nearest = replace(nominal, constraint=replace(nominal.constraint, reduction="closest"))
+    smoothing, M = _filter(nominal, x_1.shape[1]), constraint.violation(x_1)
+    corrections = {
+        PAPERS: Correction(constraint, smoothing),
+        "filter, closest approach alone": Correction(robot_avoidance(nearest, x_1.shape[2]), smoothing),
+        "covariant": Correction(constraint, covariant(source.covariance)),
+    }
+    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
+    rates, astray = figure.subplots(1, 2)
+    counts: dict[tuple[str, float], int] = {}
+    for (name, u_c), colour in zip(corrections.items(), (FILTER, PLAIN, COVARIANT), strict=True):
+        for weight in sorted({*WEIGHTS, lambda_c}):
+            path = sampled(source, x_1, minimiser(source, x_1, M, u_c, weight))
+            counts[name, weight] = int(constraint.violation(path[-1]).sum())
+            if weight == lambda_c:
+                t = torch.arange(len(path)) / SAMPLE_STEPS
+                astray.plot(t, torch.stack([_astray(source, x) for x in path]), color=colour, label=name)
+        own = {weight: count for (of, weight), count in counts.items() if of == name}
+        rate(rates, list(own), list(own.values()), SAMPLES, colour, name)
+    rates.axhline(float(M.float().mean()), color=COLLISION, ls="--", lw=1, label="demonstrations")
+    rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's network")
+    rates.set(xlabel=r"weight $\lambda_c$", ylabel="robot-collision rate")
+    rates.set_title(f"{SAMPLES} samples of the exact flow\nband: 95 % Wilson")
+    astray.set(xlabel="flow time t", xlim=(0, 1), yscale="log", ylabel="root mean square, in standard deviations")
+    astray.set_title(rf"$x_t$ beyond the first {_kept()} modes, $\lambda_c = {lambda_c:g}$")
+    for axis in (rates, astray):
+        _finish(axis, fontsize="small")
+    figure.suptitle(
+        f"The exact minimiser of the paper's loss collides in {counts[PAPERS, lambda_c]} of {SAMPLES} samples at λ = "
+        f"{lambda_c:g}:\nit leads back what the filter pushes astray, which a network has to learn"
+    )
+    return figure
+
+
+def sampled(source: Source, x_1: Tensor, v: Field) -> list[Tensor]:
+    """The states of samples of the source, with the ends of demonstrations x_1, under a field."""
+    y = source.observe(x_1[:1]).expand(SAMPLES, -1, -1).double()
+    z = torch.randn(SAMPLES, source.modes.shape[1], y.shape[2], dtype=y.dtype, generator=random_stream("explain"))
+    return list(states(v, source.mean(y) + source.modes * source.variance.sqrt() @ z, SAMPLE_STEPS))
+
+
+def _astray(source: Source, x: Tensor) -> Tensor:
+    """The root mean square of x (batch, T, D) in the modes beyond those kept, in standard deviations."""
+    return whitened(source, x).unflatten(1, (-1, x.shape[2]))[:, _kept() :].square().mean().sqrt()
+
+
 def eigenvalues(settings: Config) -> Figure:
     """How wide the source is in each of its modes, how wide the demonstrations are there, and the modes along s."""
     x = demonstrations(settings)
@@ -231,41 +283,6 @@ def predicted_end(settings: Config) -> Figure:
         f"before t = {t[even]:.2f} more of the ends do, hence the weight t"
     )
     return figure
-
-
-class Way(NamedTuple):
-    """Points on straight ways and what is known there: x_t and E[x_1 | x_t] (batch, T, D), weights (batch, N)."""
-
-    x_t: Tensor
-    end: Tensor
-    weights: Tensor
-
-
-def expected(source: Source, x_1: Tensor, t: float) -> Way:
-    """x_t from each demonstration x_1 (N, T, D) and an x_0 of its own, with E[x_1 | x_t]; all have the same y."""
-    x_0 = source.sample(source.observe(x_1), random_stream("explain"))  # the same at every t
-    x_t = interpolate(x_0, x_1, torch.full((len(x_1),), t))
-    z, z_1 = ((coordinates(source, x) / source.variance.sqrt()[:, None]).flatten(1).float() for x in (x_t, x_1))
-    weights = posterior(z, z_1, t)
-    return Way(x_t, (weights @ x_1.flatten(1)).view_as(x_1), weights)
-
-
-def posterior(z: Tensor, z_1: Tensor, t: float) -> Tensor:
-    """P(x_1 = demonstration i | x_t) = softmax_i(-|z - t z_i|^2 / (2 (1 - t)^2)), (batch, N), for t < 1.
-
-    From x_t = (1 - t) x_0 + t x_1 with z_0 ~ N(0, I), all in the source's standard deviations.
-
-    Args:
-        z: x_t, (batch, m).
-        z_1: demonstrations, (N, m), each as likely as the others.
-        t: the flow's time.
-    """
-    return torch.softmax(torch.cdist(z, t * z_1).square_().mul_(-1 / (2 * (1 - t) ** 2)), dim=1)
-
-
-def coordinates(source: Source, x: Tensor) -> Tensor:
-    """z = E^T (x - W x_O) of trajectories x (batch, T, D), (batch, m, D), in float64."""
-    return source.modes.mT @ (x.double() - source.mean(source.observe(x.double())))
 
 
 def lambda_scale(settings: Config) -> Figure:
