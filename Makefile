@@ -24,7 +24,7 @@ CONFLOW = $(PYTHON) -m conflow
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
-.PHONY: help train ablations evaluate compare reference sample figures explain demonstrations ui test test-faults lint lock
+.PHONY: help train ablations evaluate compare reference sample figures explain demonstrations bench ui test test-faults lint lock
 
 help:  ## List what can be made
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -58,6 +58,9 @@ explain: .venv/installed  ## Draw why the covariant correction works, and finish
 
 demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations $(WRITTEN) seed=$(SEED)
+
+bench: .venv/installed  ## Measure speed beside other libraries, 10 minutes on an idle machine: FORMAT=table|markdown|json REFERENCE=1
+	@$(CONFLOW) bench format=$(FORMAT) $(if $(REFERENCE),reference=1)
 
 ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
 	@$(CONFLOW) ui port=$(PORT)

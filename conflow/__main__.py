@@ -152,6 +152,26 @@ def demonstrations(arguments: list[str]) -> None:
     print(f"Written: {options['out']}; train on it with: make train ARGS=data.path={options['out']}")
 
 
+def bench(arguments: list[str]) -> None:
+    """Measure how fast everything is, beside what a user would take instead: format=table; reference=1: of record."""
+    from conflow.experiment import config, signals
+
+    signals.raise_on_signals()
+    options, _ = config.options(arguments, {"format": "table", "reference": "0"}, settings=False)
+    of_record = bool(config.whole(options, "reference", 0, 1))
+
+    from conflow.experiment import report
+
+    form = report.checked_format(options["format"])
+
+    from conflow.bench import suite, table
+
+    console = _console()
+    path = suite.REFERENCE if of_record else suite.measure(console)
+    table.render(suite.Bench.read(path), form, console)
+    print(f"{'Read from' if of_record else 'Written'}: {path}", file=sys.stderr)
+
+
 def ui(arguments: list[str]) -> None:
     """Serve MLflow's pages of all runs on this machine: port=5000."""
     from conflow.experiment import config
@@ -174,6 +194,7 @@ COMMANDS = {
     "figures": figures,
     "explain": explain,
     "demonstrations": demonstrations,
+    "bench": bench,
     "ui": ui,
 }
 

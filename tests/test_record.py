@@ -76,6 +76,30 @@ def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
     )
 
 
+def test_the_command_of_a_row_stands_beside_it() -> None:
+    """Of every row of every table, and of Table 2's columns; where it was sampled again, that too."""
+    for seed in range(2):
+        published("cgp", seed, 300)
+        published("gaussian", seed, 300)
+        published("cgp", seed, 300, "data.amplitudes=[0.9,0.15]", "data.jitter=0.05")
+    found = compare.collect_reference()
+    assert {cell.row for cell in found.cells if cell.table != "2"} <= set(found.commands)
+    assert {cell.column for cell in found.cells if cell.table == "2"} <= set(found.commands)
+    train = 'make ablations ABLATIONS=cgp SEEDS="0 1" PRESET=quick'
+    assert found.commands["default"] == train
+    assert found.commands["ConFlow (D+ and D-), sample.solver:rk4"] == (
+        f"{train} && for s in 0 1; do make evaluate RUN=cgp-s$s ARGS='sample.solver=rk4'; done"
+    )
+    (other,) = (command for command in found.commands.values() if "amplitudes" in command)
+    assert other == f"{train} ARGS='data.amplitudes=[0.9,0.15] data.jitter=0.05'"
+    console = Console(width=400)
+    with console.capture() as captured:
+        report.render(found, "markdown", console)
+    lines = captured.get().splitlines()
+    assert any(line.startswith("| default") and line.endswith(f"| {train} |") for line in lines)
+    assert f"| again with | {train.replace('cgp', 'gaussian')} | {train} |" in lines
+
+
 def test_each_ablation_is_shown_at_its_largest_scale() -> None:
     published("cgp", 0, 300)
     published("cgp", 0, 16, preset="paper")

@@ -92,8 +92,8 @@ PAPER_2 = {
 
 # Why a row differs from the paper's, most likely, and where to see it.
 REASONS = {
-    "cgp": "the filtered gradient pushes x_t to where the source has no width and the network has seen nothing, so the "
-    "negatives are imitated (make explain: support, gap)",
+    "cgp": "not the loss, whose exact minimiser is where the paper is (make explain: exact), but the network: the filter "
+    "pushes x_t to where it has seen nothing (support), and of ours only the one in the source's modes comes back",
     "no_negatives": "guidance at the paper's weights does little: what it pushes in mid-flow the flow pulls back, and "
     "half of the demonstrations pass through the obstacle (make figures: guidance, guidance_weight)",
     "fm": "from a standard normal the ends and the smoothness have to be learned, which this scale does not do (start "
@@ -152,6 +152,7 @@ class Comparison:
     """The cells of all tables, the claims, which runs they come from, and how to make the runs of a row again.
 
     Attributes:
+        commands: what makes a row again, by its name.
         reading: how the paper was read, in settings; rows that were read otherwise say so.
         reasons: why rows differ from the paper's, for those that do.
     """
@@ -209,22 +210,45 @@ def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping
     cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *_table_4(runs, readings)]
     settings = next(iter(runs.get("cgp") or next(iter(runs.values())))).settings
     differing = {cell.row for cell in cells if cell is not None and cell.paper_p is not None and cell.paper_p < LEVEL}
-    named = {METHODS.get(ablation, ablation): of_row for ablation, of_row in runs.items()} | dict(readings)
     return Comparison(
         preset,
         [cell for cell in cells if cell is not None],
         _claims(runs),
         {name: [one.run_id for one in of_row] for name, of_row in (dict(runs) | dict(readings)).items()},
-        {name: _command(of_row) for name, of_row in named.items()},
+        _commands(runs, readings),
         " ".join(f"{key}={settings[key]}" for key in OPEN if key in settings),
         {METHODS[name]: reason for name, reason in REASONS.items() if METHODS[name] in differing},
     )
 
 
+def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> dict[str, str]:
+    """What makes each row again, by the row's name."""
+    found = {name: _command(of_row) for name, of_row in readings.items()}
+    for ablation, of_row in runs.items():
+        name, again = METHODS.get(ablation, ablation), _command(of_row)
+        found |= {name: again, f"no model: source {ablation}": again}
+        seeds = " ".join(str(one.seed) for one in of_row)
+        for label in _labels(of_row):
+            arguments = label.replace(":", "=")
+            evaluated = f"for s in {seeds}; do make evaluate RUN={ablation}-s$s ARGS='{arguments}'; done"
+            found[f"{name}, {label}"] = f"{again} && {evaluated}"
+    if "cgp" in runs:
+        found["default"] = _command(runs["cgp"])
+    first = next(iter(runs.values()))[:1]
+    return found | dict.fromkeys(("no model: test data", "no model: feasible test data"), _command(first))
+
+
+def _labels(runs: Sequence[Record]) -> list[str]:
+    """The settings that runs were sampled with again."""
+    return sorted({key.split("/")[1] for one in runs for key in one.metrics if key.startswith("evaluate/")})
+
+
 def _command(runs: Sequence[Record]) -> str:
     """What makes these runs again."""
     seeds, one = " ".join(str(of_seed.seed) for of_seed in runs), runs[0]
-    arguments = f" ARGS='{' '.join(one.changes())}'" if one.changes() else ""
+    # Without the spaces of a list, at which the shell would cut it.
+    changes = [change.replace(", ", ",") for change in one.changes()]
+    arguments = f" ARGS='{' '.join(changes)}'" if changes else ""
     return f'make ablations ABLATIONS={one.ablation} SEEDS="{seeds}" PRESET={one.preset}{arguments}'
 
 
@@ -261,8 +285,7 @@ def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Recor
     """ConFlow under other readings: trained with them, or, where that is enough, sampled and judged again with them."""
     rows = [("default", "test/", runs.get("cgp", [])), *((name, "test/", of_row) for name, of_row in readings.items())]
     for name, of_row in runs.items():
-        labels = sorted({key.split("/")[1] for one in of_row for key in one.metrics if key.startswith("evaluate/")})
-        rows += [(f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", of_row) for label in labels]
+        rows += [(f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", of_row) for label in _labels(of_row)]
     if len(rows) == 1:
         return []
     return [
@@ -330,6 +353,7 @@ def _claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
     ]
     others = [(metric, row) for metric, row in QUALITIES.items() if metric != none]
     ours = [
+        ("the spectral network lets ConFlow collide less, without guidance", "spectral", "cgp", none),
         ("plus collides less than ConFlow, without guidance", "plus", "cgp", none),
         ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
     ]

@@ -5,7 +5,7 @@ import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from rich.console import Console
 from rich.table import Table
@@ -15,6 +15,7 @@ from conflow.experiment.config import ConfigError
 from conflow.experiment.evaluation import Metrics
 from conflow.experiment.module import Setting
 
+AGAIN = "again with"
 Format = Literal["table", "markdown", "csv", "json"]
 
 ROWS = {
@@ -35,14 +36,14 @@ ROWS = {
 def results_table(results: dict[Setting, Metrics], title: str) -> Table:
     """The test metrics of one run, a column for each setting, each with its 95 % interval."""
     num = int(next(iter(results.values()))["num"])
-    table = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
-    table.add_column("metric")
+    made = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
+    made.add_column("metric")
     for setting in results:
-        table.add_column(setting, justify="right")
+        made.add_column(setting, justify="right")
     for key, label in ROWS.items():
-        table.add_row(label, *(_estimate(metrics, key) for metrics in results.values()))
-    table.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
-    return table
+        made.add_row(label, *(_estimate(metrics, key) for metrics in results.values()))
+    made.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
+    return made
 
 
 def _estimate(metrics: Metrics, key: str) -> str:
@@ -70,17 +71,23 @@ def render(comparison: Comparison, form: Format, console: Console) -> None:
     if form == "json":
         console.out(json.dumps(asdict(comparison), indent=1), highlight=False)
     elif form == "csv":
-        text = io.StringIO()
-        writer = csv.DictWriter(text, [field.name for field in fields(Cell)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(cell) for cell in comparison.cells)
-        console.out(text.getvalue(), end="", highlight=False)
+        console.out(csv_text(Cell, comparison.cells), end="", highlight=False)
     else:
         for title, header, rows in _sheets(comparison):
             if form == "markdown":
-                console.out(_markdown(title, header, rows), highlight=False)
+                console.out(markdown(title, header, rows), highlight=False)
             else:
-                console.print(_table(title, header, rows))
+                console.print(table(title, header, rows))
+        console.out(f"Unless a row says otherwise: {comparison.reading}", highlight=False)
+
+
+def csv_text(kind: Any, rows: Iterable[Any]) -> str:
+    """Dataclasses of a kind as CSV, a line each under the names of the fields."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [field.name for field in fields(kind)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    return text.getvalue()
 
 
 def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
@@ -93,8 +100,8 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         "4": (f"Table 4: what the paper leaves open, changed one at a time, preset {preset}", READINGS),
     }
     sheets = []
-    for table, (title, metrics) in tables.items():
-        cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == table}
+    for number, (title, metrics) in tables.items():
+        cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == number}
         columns = _ordered((column for _, column in cells), metrics.values())
         rows = []
         for row in _ordered((row for row, _ in cells), metrics.values()):
@@ -103,16 +110,17 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
             size = (
                 f"{known.preset}, {known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
             )
-            rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row)])
+            again = comparison.commands.get(row, "")
+            rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row), again])
+        if number == "2":  # whose columns are the methods
+            rows = [row[:-1] for row in rows] + [[AGAIN, *(comparison.commands.get(column, "") for column in columns)]]
         if cells:
-            sheets.append((title, ["", *columns], rows))
+            sheets.append((title, ["", *columns, *([] if number == "2" else [AGAIN])], rows))
     claims = [[claim.text, claim.verdict, _p(claim.p), claim.detail] for claim in comparison.claims]
     sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
     if comparison.reasons:
         differing = [list(pair) for pair in comparison.reasons.items()]
         sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
-    again = [["all, unless they say otherwise, read as", comparison.reading], *map(list, comparison.commands.items())]
-    sheets.append(("The runs of a row again", ["row", "command"], again))
     return sheets
 
 
@@ -142,16 +150,18 @@ def _text(cell: Cell) -> str:
     return "\n".join(parts)
 
 
-def _table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(title=title, show_lines=True)
+def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table for the terminal."""
+    made = Table(title=title, show_lines=True)
     for name in header:
-        table.add_column(name)
+        made.add_column(name)
     for row in rows:
-        table.add_row(*(text.replace("[", "\\[") for text in row))
-    return table
+        made.add_row(*(text.replace("[", "\\[") for text in row))
+    return made
 
 
-def _markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
     lines = [f"**{title}**", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     lines += ["| " + " | ".join(text.replace("\n", "<br>") for text in row) + " |" for row in rows]
     return "\n".join(lines) + "\n"

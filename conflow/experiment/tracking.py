@@ -273,15 +273,22 @@ def _end(logger: RunLogger, status: str) -> None:
 
 
 def _tags(config: Config) -> dict[str, str]:
-    sha, dirty = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
     return {
         "ablation": config.ablation,
         "preset": config.preset,
         "seed": str(config.seed),
-        "git_sha": sha if sha is not None else "unknown",
-        "git_dirty": str(bool(dirty)).lower() if dirty is not None else "unknown",
         "config_sha": config.sha(),
         "pid": str(os.getpid()),
+        **origin(),
+    }
+
+
+def origin() -> dict[str, str]:
+    """What is at work: this program's revision, the versions of its libraries, the hardware."""
+    sha, dirty = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+    return {
+        "git_sha": sha if sha is not None else "unknown",
+        "git_dirty": str(bool(dirty)).lower() if dirty is not None else "unknown",
         "versions": ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "mlflow")),
         "hardware": _hardware(),
         "threads": str(torch.get_num_threads()),

@@ -37,7 +37,6 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
         CheckpointError: a checkpoint could not be written.
         DivergedError: a loss or gradient was not finite.
     """
-    _quiet()
     lightning.seed_everything(config.seed, verbose=False)
     data = DemonstrationData(config)
     model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
@@ -101,6 +100,7 @@ def _quiet() -> None:
 
 def trainer(config: Config, logger: tracking.RunLogger, data: DemonstrationData, display: ProgressDisplay) -> Trainer:
     """The training loop of an experiment."""
+    _quiet()
     interval = min(config.train.val_every, config.train.max_steps)
     return Trainer(
         accelerator="auto",
