@@ -1,7 +1,11 @@
 """How time and memory grow with the batch, the waypoints, the width of the network, and the number of samples."""
 
-from collections.abc import Callable, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from matplotlib.figure import Figure
@@ -61,13 +65,27 @@ def _points(axis: str, calls: dict[int, Callable[[], object]], pace: Pace) -> li
 
 def peak(call: Callable[[], object]) -> int:
     """The most bytes that a call's tensors take at once, to one operation."""
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
+    with _hushed(), profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
         call()
     taken, most = 0, 0
     for event in sorted(profiler.events(), key=lambda event: event.time_range.start):
         taken += event.self_cpu_memory_usage
         most = max(most, taken)
     return most
+
+
+@contextmanager
+def _hushed() -> Iterator[None]:
+    """Keep the profiler's own lines, which it writes past Python, off the terminal."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def figure(found: Sequence[Point]) -> Figure:
