@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from torch.profiler import ProfilerActivity, profile
 
 from conflow.bench.clock import Pace, alternate, block, quartiles
@@ -102,6 +103,7 @@ def figure(found: Sequence[Point]) -> Figure:
             panel.set(xscale="log", yscale="log")
             panel.set_xticks(sizes, [str(size) for size in sizes])
             panel.set_xticks([], minor=True)
+            panel.yaxis.set_minor_formatter(NullFormatter())
             panel.spines[["top", "right"]].set_visible(False)
         below.set_xlabel(axis)
         above.set_title("sampling, 50 Euler steps" if axis == "samples" else "a training step", fontsize="medium")

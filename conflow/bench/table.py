@@ -47,12 +47,14 @@ def seconds(value: float) -> str:
 def _ratio(row: Row) -> str:
     if row.ratio is None or row.low is None or row.high is None:
         return ""
-    if row.kind == "share":
-        return f"{row.ratio:.1%} [{row.low:.1%}, {row.high:.1%}]"
-    if row.kind == "seconds":
-        return f"[{seconds(row.low)}, {seconds(row.high)}]"
-    word = "times its time" if row.kind == "time" else "times as fast"
-    return f"{row.ratio:.3g} {word} [{row.low:.3g}, {row.high:.3g}]"
+    words = {"share": "of it", "time": "times its time", "speed": "times as fast", "seconds": ""}
+    forms = {"share": "{:.2%}", "time": "{:.3g}", "speed": "{:.3g}"}
+    low, middle, high = (
+        seconds(one) if row.kind == "seconds" else forms[row.kind].format(one) for one in (row.low, row.ratio, row.high)
+    )
+    spread = f"[{low}, {high}]" if row.low < row.high else ""  # of one measurement there is none
+    ratio = "" if row.kind == "seconds" else f"{middle} {words[row.kind]}"  # which stands in the column before
+    return " ".join(filter(None, [ratio, spread]))
 
 
 def _target(row: Row) -> str:
