@@ -199,6 +199,7 @@ def exact(settings: Config) -> Figure:
     rates.axhline(float(M.float().mean()), color=COLLISION, ls="--", lw=1, label="demonstrations")
     rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's network")
     rates.set(xlabel=r"weight $\lambda_c$", ylabel="robot-collision rate")
+    rates.set_ylim(top=1.6 * rates.get_ylim()[1])  # room for the legend
     rates.set_title(f"{SAMPLES} samples of the exact flow\nband: 95 % Wilson")
     astray.set(xlabel="flow time t", xlim=(0, 1), yscale="log", ylabel="root mean square, in standard deviations")
     astray.set_title(rf"$x_t$ beyond the first {_kept()} modes, $\lambda_c = {lambda_c:g}$")
