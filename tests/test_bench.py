@@ -244,6 +244,32 @@ def test_the_shares_of_a_run_add_up(elsewhere: Path) -> None:
     assert 0.3 < whole_run <= 1.0  # the rest: making data and model
 
 
+def test_curves_are_those_of_finished_runs_of_an_ablation(elsewhere: Path) -> None:
+    """Measured more often a run still counts; with another training, or without its seconds, it does not."""
+    store = tracking.client()
+    experiment = store.get_experiment_by_name("conflow")
+    assert experiment is not None
+    for seed, changes, timed in (
+        (0, [], True),
+        (1, ["train.val_every=10"], True),
+        (2, ["train.lr=1"], True),
+        (3, [], False),
+    ):
+        settings = config.load(["preset=smoke", f"seed={seed}", *changes])
+        tags = {"ablation": "cgp", "preset": "smoke", "seed": str(seed), "hardware": "a machine", "threads": "2"}
+        run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
+        for key, value in config.flatten(settings.tree()).items():
+            store.log_param(run_id, key, str(value))
+        for step in (10, 20, 30):
+            store.log_metric(run_id, "val/none/robot_collision_count", 7 - step // 10, step=step)
+            if timed and step > 10:
+                store.log_metric(run_id, "train/seconds", step / 10, step=step)
+        store.set_terminated(run_id, "FINISHED")
+    found = quality.curves("smoke")
+    assert [(one.ablation, one.seed) for one in found] == [("cgp", 0), ("cgp", 1)]
+    assert found[0] == Curve("cgp", 0, [20, 30], [2.0, 3.0], [5, 4], 64, "a machine, 2 threads")
+
+
 def curve(ablation: str, counts: list[int], seed: int = 0) -> Curve:
     return Curve(ablation, seed, [100, 200, 300], [1.0, 2.0, 3.0], counts, 256, "a machine, 2 threads")
 

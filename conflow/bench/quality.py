@@ -9,6 +9,7 @@ from mlflow.entities import Run
 
 from conflow.bench.clock import Row, alone
 from conflow.experiment import config, tracking
+from conflow.experiment.callbacks import VALIDATION_SAMPLES
 from conflow.experiment.compare import METHODS
 from conflow.experiment.figures.curves import MARK
 from conflow.experiment.figures.front import COLOURS, MARKERS
@@ -65,7 +66,7 @@ def _curve(run: Run) -> Curve:
     counts = {step: int(count) for step, count in _history(run, "val/none/robot_collision_count").items()}
     # At the last step training is logged whatever its number; in between where both intervals meet.
     steps = sorted(counts.keys() & seconds.keys())
-    total = min(256, int(run.data.params["sample.num"]))
+    total = min(VALIDATION_SAMPLES, int(run.data.params["sample.num"]))
     tags = run.data.tags
     hardware = f"{tags['hardware']}, {tags['threads']} threads"
     at = [seconds[step] for step in steps]
