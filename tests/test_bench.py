@@ -286,7 +286,10 @@ def test_quality_is_reached_at_the_first_validation_that_shows_it() -> None:
 
 
 def test_a_bench_survives_its_file_and_prints_in_every_form(elsewhere: Path) -> None:
-    rows = [compared("a part", "ours", "theirs", [1.0], [2.0], "speed", Target(3, at_most=False)), alone("b", "c", [1])]
+    rows = [
+        compared("a part", "ours", "theirs", [1.0, 1.0], [2.0, 4.0], "speed", Target(4, at_most=False)),
+        alone("b", "c", [1]),
+    ]
     said = {"hardware": "a machine", "threads": "2", "versions": "torch 2", "date": "today"}
     bench = Bench(said, rows, [scaling.Point("batch", 1, 1.0, 1.0)], [curve("plus", [1, 2, 3])])
     path = elsewhere / "runs" / "reference" / "bench.json"
@@ -294,9 +297,9 @@ def test_a_bench_survives_its_file_and_prints_in_every_form(elsewhere: Path) -> 
     path.write_text(json.dumps(asdict(bench)))
     assert Bench.read(path) == bench
     for form, expected in {
-        "table": "missed, 0.67 times that",
-        "markdown": "| ours | 1 s | theirs | 2 s | 2 times as fast [2, 2] | at least 3: missed, 0.67 times that |",
-        "csv": "a part,ours,theirs,1.0,2.0,speed,2.0",
+        "table": "missed, 0.75 times that",
+        "markdown": "| ours | 1 s | theirs | 3 s | 3 times as fast [2.5, 3.5] | at least 4: missed, 0.75 times that |",
+        "csv": "a part,ours,theirs,1.0,3.0,speed,3.0",
         "json": '"hardware": "a machine"',
     }.items():
         console = Console(width=200)
