@@ -59,7 +59,7 @@ explain: .venv/installed  ## Draw why the covariant correction works, and finish
 demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations $(WRITTEN) seed=$(SEED)
 
-bench: .venv/installed  ## Measure speed beside other libraries, 10 minutes on an idle machine: FORMAT=table|markdown|json REFERENCE=1
+bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)
 	@$(CONFLOW) bench format=$(FORMAT) $(if $(REFERENCE),reference=1)
 
 ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
