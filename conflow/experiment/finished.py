@@ -56,7 +56,7 @@ def check_data(run: Run, data: DemonstrationData) -> None:
         DemonstrationError: they are others.
     """
     trained_on = run.data.tags.get("data_digest")
-    if trained_on not in (data.digest, None):  # None: interrupted before it was said
+    if trained_on != data.digest:
         raise DemonstrationError(
             f"data.path={data.config.data.path}: found data {data.digest}, expected {trained_on}, on which "
             f"{run.info.run_name} was trained"

@@ -223,7 +223,7 @@ def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -
         try:
             # A signal between the store's commit and its answer would leave a run that nobody knows of to end.
             with held():
-                run_id = _create(store, config, lock) if resumed is None else _reopen(store, resumed, lock)
+                run_id = _create(store, config, data, lock) if resumed is None else _reopen(store, resumed, lock)
                 logger = RunLogger(store, run_id, again=resumed is not None)
             _describe(store, run_id, config, data)
             yield logger
@@ -236,11 +236,13 @@ def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -
                 _end(logger, status)
 
 
-def _create(store: MlflowClient, config: Config, lock: dict[str, str]) -> str:
+def _create(store: MlflowClient, config: Config, data: DemonstrationData, lock: dict[str, str]) -> str:
     experiment = store.get_experiment_by_name(EXPERIMENT)
     assert experiment is not None
     name = f"{config.ablation}-s{config.seed}"
-    return str(store.create_run(experiment.experiment_id, run_name=name, tags=_tags(config) | lock).info.run_id)
+    # With the run at once, not after it: by these tags it is found again, however early it is interrupted.
+    tags = _tags(config, data) | lock
+    return str(store.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id)
 
 
 def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
@@ -272,12 +274,15 @@ def _end(logger: RunLogger, status: str) -> None:
                 raise
 
 
-def _tags(config: Config) -> dict[str, str]:
+def _tags(config: Config, data: DemonstrationData) -> dict[str, str]:
     return {
         "ablation": config.ablation,
         "preset": config.preset,
         "seed": str(config.seed),
         "config_sha": config.sha(),
+        "data_digest": data.digest,
+        "data_violating_share": f"{data.violates.float().mean():.4f}",
+        **{f"data_{split}": str(len(getattr(data, split).x)) for split in ("train", "val", "test")},
         "pid": str(os.getpid()),
         **origin(),
     }
@@ -321,10 +326,3 @@ def _log_dataset(store: MlflowClient, run_id: str, data: DemonstrationData) -> N
     except MlflowException:
         # Of two runs that add the same new data set at once MLflow fails the slower one; by now the data set is there.
         store.log_inputs(run_id, inputs)
-    description = {
-        "data_digest": data.digest,
-        "data_violating_share": f"{data.violates.float().mean():.4f}",
-        **{f"data_{split}": len(getattr(data, split).x) for split in ("train", "val", "test")},
-    }
-    for key, value in description.items():
-        store.set_tag(run_id, key, value)

@@ -46,6 +46,15 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert runs(tmp_path)[0].data.tags["resumed"] == "1"
 
 
+def test_a_cell_that_died_as_it_was_begun_goes_on_as_the_same_run(tmp_path: Path) -> None:
+    begun = ("train", "preset=smoke", "ablation=fm", "seed=0")
+    death = processes.killed_in("conflow.experiment.tracking", "_describe")
+    assert processes.run(tmp_path, *begun, death=death)[0] == -signal.SIGKILL
+    code, said = processes.run(tmp_path, "ablations", "preset=smoke", "seeds=0", "ablations=fm")
+    assert code == 0, said
+    assert statuses(tmp_path) == [("fm-s0", "FINISHED")]
+
+
 def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
     x = swap(600)
     feasible = x[~RobotAvoidance(PointRobots(2)).violation(x)]
