@@ -109,6 +109,25 @@ def test_each_ablation_is_shown_at_its_largest_scale() -> None:
     assert cell(found, "1", "FM (D+)", "none: robot").preset == "quick"
 
 
+def test_the_same_change_at_another_scale_is_a_row_of_its_own() -> None:
+    published("cgp", 0, 300)
+    published("cgp", 0, 290, "train.batch_size=512")
+    published("cgp", 0, 280, "train.batch_size=512", preset="paper")
+    found = compare.collect_reference()
+    at_quick, at_paper = (
+        cell(found, "4", f"ConFlow (D+ and D-), {change}", "none: robot")
+        for change in ("train.batch_size=512", "preset=paper train.batch_size=512")
+    )
+    assert (at_quick.count, at_quick.preset) == (290, "quick")
+    assert (at_paper.count, at_paper.preset) == (280, "paper")
+    console = Console(width=400)
+    with console.capture() as captured:
+        report.render(found, "markdown", console)
+    titles = [line for line in captured.get().splitlines() if line.startswith("**Table")]
+    assert ["paper and quick" in title for title in titles] == [False] * (len(titles) - 1) + [True]
+    assert titles[-1].startswith("**Table 4")
+
+
 def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
     published("cgp", 0, 300)
     published("no_negatives", 0, 40)
@@ -126,7 +145,9 @@ def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
 def test_no_records_and_broken_ones_are_named() -> None:
     with pytest.raises(ConfigError, match="expected records in"):
         compare.collect_reference()
-    published("cgp", 0, 1)
+    published("cgp", 0, 1, "correction.lambda_c=1")
+    with pytest.raises(ConfigError, match="expected records without changed settings"):
+        compare.collect_reference()
     (record.FOLDER / "broken.json").write_text("{")
     with pytest.raises(ConfigError, match=r"broken\.json: expected the record of a run"):
         compare.collect_reference()

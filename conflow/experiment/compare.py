@@ -182,15 +182,19 @@ def collect_reference() -> Comparison:
     """Compare the records under runs/reference/: each ablation at its largest scale, and other readings of the paper.
 
     Raises:
-        ConfigError: there are none.
+        ConfigError: there are none, or none of an ablation as it is.
     """
     records = record.from_files()
     scale = {"smoke": 0, "quick": 1, "paper": 2}
-    largest = {one.ablation: one.preset for one in sorted(records, key=lambda one: scale.get(one.preset, 0))}
-    plain = [one for one in records if not one.changes() and one.preset == largest[one.ablation]]
     changed = [one for one in records if one.changes()]
+    unchanged = sorted((one for one in records if not one.changes()), key=lambda one: scale.get(one.preset, 0))
+    if not unchanged:
+        raise ConfigError(f"reference: expected records without changed settings in {record.FOLDER}, found none")
+    largest = {one.ablation: one.preset for one in unchanged}
+    plain = [one for one in unchanged if one.preset == largest[one.ablation]]
     presets = " and ".join(sorted({one.preset for one in records}))
-    return _comparison(presets, _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading))
+    readings = _grouped(changed, lambda one: _reading(one, largest))
+    return _comparison(presets, _grouped(plain, lambda one: one.ablation), readings)
 
 
 def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[str, list[Record]]:
@@ -202,8 +206,10 @@ def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[s
     return groups
 
 
-def _reading(one: Record) -> str:
-    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join(one.changes())}"
+def _reading(one: Record, largest: Mapping[str, str]) -> str:
+    """The name of a row for a changed run: all that sets it apart from the row without changes."""
+    scale = [] if one.preset == largest.get(one.ablation) else [f"preset={one.preset}"]
+    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join([*scale, *one.changes()])}"
 
 
 def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> Comparison:

@@ -92,12 +92,11 @@ def csv_text(kind: Any, rows: Iterable[Any]) -> str:
 
 def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
     """Title, header and rows of the tables and of the claims, as text."""
-    preset = comparison.preset
     tables = {
-        "1": (f"Table 1: collision rates, preset {preset} (setting: what is hit)", COLLISIONS),
-        "2": (f"Table 2: sources, without guidance, preset {preset}", QUALITIES | SMOOTHNESS),
-        "3": (f"Table 3: quality without guidance, preset {preset}", GUARDS),
-        "4": (f"Table 4: what the paper leaves open, changed one at a time, preset {preset}", READINGS),
+        "1": ("Table 1: collision rates (setting: what is hit)", COLLISIONS),
+        "2": ("Table 2: sources, without guidance", QUALITIES | SMOOTHNESS),
+        "3": ("Table 3: quality without guidance", GUARDS),
+        "4": ("Table 4: what the paper leaves open, changed one at a time", READINGS),
     }
     sheets = []
     for number, (title, metrics) in tables.items():
@@ -115,7 +114,8 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         if number == "2":  # whose columns are the methods
             rows = [row[:-1] for row in rows] + [[AGAIN, *(comparison.commands.get(column, "") for column in columns)]]
         if cells:
-            sheets.append((title, ["", *columns, *([] if number == "2" else [AGAIN])], rows))
+            presets = " and ".join(sorted({cell.preset for cell in cells.values()}))
+            sheets.append((f"{title}, preset {presets}", ["", *columns, *([] if number == "2" else [AGAIN])], rows))
     claims = [[claim.text, claim.verdict, _p(claim.p), claim.detail] for claim in comparison.claims]
     sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
     if comparison.reasons:
