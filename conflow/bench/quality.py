@@ -112,7 +112,8 @@ def figure(found: Sequence[Curve]) -> Figure:
     axis.set_yscale("symlog", linthresh=0.01)
     axis.set(xlabel="seconds of training", ylabel="robot-collision rate on validation, no guidance")
     axis.set_ylim(bottom=-5e-4)
-    axis.set_title(f"{found[0].total} samples a validation; {found[0].hardware}")
+    hardware = " and ".join(sorted({one.hardware for one in found}))
+    axis.set_title(f"{found[0].total} samples a validation; {hardware}")
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, ncols=2)
     return drawn

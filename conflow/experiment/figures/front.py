@@ -10,7 +10,7 @@ from mlflow.entities import Run
 from conflow.experiment.metrics import wilson
 
 METRIC = "test/none/"
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255")
 MARKERS = "osD^vP*X<>pdh8"
 
 
