@@ -92,8 +92,8 @@ PAPER_2 = {
 
 # Why a row differs from the paper's, most likely, and where to see it.
 REASONS = {
-    "cgp": "not the loss, whose exact minimiser is where the paper is (make explain: exact), but the network: the "
-    "filter pushes x_t to where it has seen nothing (support), and of ours only the spectral one comes back",
+    "cgp": "too few steps: the filter pushes x_t to where the source has no mass (make explain: support), and the "
+    "network learns only late to lead it back; trained for as many steps as the paper's it does (Table 4)",
     "no_negatives": "guidance at the paper's weights does little: what it pushes in mid-flow the flow pulls back, and "
     "half of the demonstrations pass through the obstacle (make figures: guidance, guidance_weight)",
     "fm": "from a standard normal the ends and the smoothness have to be learned, which this scale does not do (start "
