@@ -49,7 +49,7 @@ def test_an_ablation_changes_only_what_its_name_says(ablation: str) -> None:
     assert changes(f"ablation={ablation}") - {"ablation"} == CHANGES[ablation]
 
 
-@pytest.mark.parametrize("preset", ["paper", "quick", "smoke"])
+@pytest.mark.parametrize("preset", ["long", "paper", "quick", "smoke"])
 def test_a_preset_says_how_much_compute_and_nothing_about_the_method(preset: str) -> None:
     assert all(
         key.split(".")[0] in {"preset", "network", "train"} or key in {"data.num", "sample.num", "sample.steps"}

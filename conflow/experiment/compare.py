@@ -33,6 +33,8 @@ METHODS = {
     "few_steps": "few solver steps",
     "plus": "plus: the best together",
 }
+SCALES = ("smoke", "quick", "long", "paper")
+"""The presets, by how much is trained."""
 SOURCES = ("cgp", "gaussian", "gp", "spectral", "fitted", "plus")
 """The ablations whose sources differ."""
 COLLISIONS = {
@@ -185,9 +187,8 @@ def collect_reference() -> Comparison:
         ConfigError: there are none, or none of an ablation as it is.
     """
     records = record.from_files()
-    scale = {"smoke": 0, "quick": 1, "paper": 2}
     changed = [one for one in records if one.changes()]
-    unchanged = sorted((one for one in records if not one.changes()), key=lambda one: scale.get(one.preset, 0))
+    unchanged = sorted((one for one in records if not one.changes()), key=lambda one: SCALES.index(one.preset))
     if not unchanged:
         raise ConfigError(f"reference: expected records without changed settings in {record.FOLDER}, found none")
     largest = {one.ablation: one.preset for one in unchanged}
