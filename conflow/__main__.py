@@ -47,7 +47,7 @@ def ablations(arguments: list[str]) -> None:
 
     console = _console()
     failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console)
-    report.render(compare.collect(options["preset"], settings), "table", console)
+    report.render([compare.collect(options["preset"], settings)], "table", console)
     if failed:
         raise config.ConfigError(f"{failed} cells failed; the same command tries them again")
 
@@ -73,7 +73,7 @@ def compare(arguments: list[str]) -> None:
     config.load([f"preset={options['preset']}", *settings])  # of a mistyped one there are no runs either
 
     form = report.checked_format(options["format"])
-    found = compare.collect_reference() if of_record else compare.collect(options["preset"], settings)
+    found = compare.collect_reference() if of_record else [compare.collect(options["preset"], settings)]
     report.render(found, form, _console())
 
 

@@ -115,12 +115,13 @@ def test_no_permutation_of_two_seeds_and_two_can_be_significant(
 
 def rendered(comparison: Comparison, form: report.Format) -> str:
     console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
-    report.render(comparison, form, console)
+    report.render([comparison], form, console)
     return console.export_text()
 
 
 def test_json_holds_everything_and_csv_every_cell(comparison: Comparison) -> None:
-    tree: Mapping[str, list[dict[str, object]]] = json.loads(rendered(comparison, "json"))
+    trees: list[Mapping[str, list[dict[str, object]]]] = json.loads(rendered(comparison, "json"))
+    (tree,) = trees
     assert len(tree["cells"]) == len(comparison.cells)
     assert tree["cells"][0]["value"] == comparison.cells[0].value
     lines = rendered(comparison, "csv").splitlines()
@@ -206,7 +207,7 @@ def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: repor
     elif form == "csv":
         assert len(text.split()) > len(patchy.cells)
     elif form == "json":
-        assert len(json.loads(text)["cells"]) == len(patchy.cells)
+        assert len(json.loads(text)[0]["cells"]) == len(patchy.cells)
 
 
 @pytest.mark.parametrize("form", get_args(report.Format))

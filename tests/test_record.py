@@ -8,7 +8,7 @@ from rich.console import Console
 from scipy import stats
 
 from conflow.experiment import compare, record, report, tracking
-from conflow.experiment.config import ConfigError, flatten, load
+from conflow.experiment.config import ConfigError, flatten, load, names
 from conflow.experiment.record import Record
 
 
@@ -64,7 +64,7 @@ def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
     for seed in range(3):
         published("cgp", seed, 300 + seed)
         published("cgp", seed, 200 + seed, "constraint.reduction=closest")
-    found = compare.collect_reference()
+    (found,) = compare.collect_reference()
     plain = cell(found, "1", "ConFlow (D+ and D-)", "none: robot")
     assert (plain.count, plain.trajectories, plain.seeds, plain.preset) == (903, 3000, 3, "quick")
     reading = "ConFlow (D+ and D-), constraint.reduction=closest"
@@ -82,7 +82,7 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
         published("cgp", seed, 300)
         published("gaussian", seed, 300)
         published("cgp", seed, 300, "data.amplitudes=[0.9,0.15]", "data.jitter=0.05")
-    found = compare.collect_reference()
+    (found,) = compare.collect_reference()
     assert {cell.row for cell in found.cells if cell.table != "2"} <= set(found.commands)
     assert {cell.column for cell in found.cells if cell.table == "2"} <= set(found.commands)
     train = 'make ablations ABLATIONS=cgp SEEDS="0 1" PRESET=quick'
@@ -94,50 +94,60 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
     assert other == f"{train} ARGS='data.amplitudes=[0.9,0.15] data.jitter=0.05'"
     console = Console(width=400)
     with console.capture() as captured:
-        report.render(found, "markdown", console)
+        report.render([found], "markdown", console)
     lines = captured.get().splitlines()
     assert any(line.startswith("| default") and line.endswith(f"| {train} |") for line in lines)
     assert f"| again with | {train.replace('cgp', 'gaussian')} | {train} |" in lines
 
 
-def test_each_ablation_is_shown_at_its_largest_scale() -> None:
-    published("cgp", 0, 300)
-    published("cgp", 0, 16, preset="paper")
-    published("fm", 0, 31)
-    found = compare.collect_reference()
-    assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").preset == "paper"
-    assert cell(found, "1", "FM (D+)", "none: robot").preset == "quick"
+def test_a_narrow_terminal_cuts_no_command_short() -> None:
+    published("no_negatives", 0, 300)
+    console = Console(width=80)
+    with console.capture() as captured:
+        report.render(compare.collect_reference(), "table", console)
+    beside = "".join(line.rsplit("│", 2)[1].strip() for line in captured.get().splitlines() if line.endswith("│"))
+    assert "ABLATIONS=no_negatives" in beside
 
 
-def test_the_same_change_at_another_scale_is_a_row_of_its_own() -> None:
+def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() -> None:
+    """A claim never sets a long training against a short one; a change alone is still a row at its preset."""
     published("cgp", 0, 300)
     published("cgp", 0, 290, "train.batch_size=512")
+    published("cgp", 0, 16, preset="long")
+    published("fm", 0, 31)
     published("cgp", 0, 280, "train.batch_size=512", preset="paper")
-    found = compare.collect_reference()
-    at_quick, at_paper = (
-        cell(found, "4", f"ConFlow (D+ and D-), {change}", "none: robot")
-        for change in ("train.batch_size=512", "preset=paper train.batch_size=512")
-    )
-    assert (at_quick.count, at_quick.preset) == (290, "quick")
-    assert (at_paper.count, at_paper.preset) == (280, "paper")
+    paper, long, quick = compare.collect_reference()
+    assert (paper.preset, long.preset, quick.preset) == ("paper", "long", "quick")
+    change = "ConFlow (D+ and D-), train.batch_size=512"
+    assert [cell(found, "4", change, "none: robot").count for found in (paper, quick)] == [280, 290]
+    assert [cell(found, "1", "ConFlow (D+ and D-)", "none: robot").count for found in (long, quick)] == [16, 300]
+    verdicts = [next(iter(found.claims)).verdict for found in (long, quick)]
+    assert verdicts == ["no runs", "reversed"]
+    assert (paper.claims, {each.table for each in paper.cells}) == ([], {"4"})
+    assert "PRESET=paper ARGS='train.batch_size=512'" in paper.commands[change]
     console = Console(width=400)
     with console.capture() as captured:
-        report.render(found, "markdown", console)
-    titles = [line for line in captured.get().splitlines() if line.startswith("**Table")]
-    assert ["paper and quick" in title for title in titles] == [False] * (len(titles) - 1) + [True]
-    assert titles[-1].startswith("**Table 4")
+        report.render([paper, long, quick], "markdown", console)
+    titles = [line.strip("*") for line in captured.get().splitlines() if line.startswith("**Table")]
+    assert [title[6] + title.rsplit(" ", 1)[1] for title in titles] == [
+        *("4paper", "1long", "2long", "3long", "4long", "1quick", "2quick", "3quick", "4quick")
+    ]
+
+
+def test_every_preset_has_its_place_among_the_scales() -> None:
+    assert set(compare.SCALES) == set(names("preset"))
 
 
 def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
     published("cgp", 0, 300)
     published("no_negatives", 0, 40)
-    found = compare.collect_reference()
+    (found,) = compare.collect_reference()
     assert cell(found, "1", "ConFlow (D+)", "none: robot").paper_p == pytest.approx(
         stats.fisher_exact([[40, 960], [11, 245]]).pvalue
     )
     console = Console()
     with console.capture() as captured:
-        report.render(found, "markdown", console)
+        report.render([found], "markdown", console)
     assert "paper 0.043, not distinguishable" in captured.get()
     assert "paper 0.016, differs" in captured.get()
 
@@ -145,9 +155,7 @@ def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
 def test_no_records_and_broken_ones_are_named() -> None:
     with pytest.raises(ConfigError, match="expected records in"):
         compare.collect_reference()
-    published("cgp", 0, 1, "correction.lambda_c=1")
-    with pytest.raises(ConfigError, match="expected records without changed settings"):
-        compare.collect_reference()
+    published("cgp", 0, 1)
     (record.FOLDER / "broken.json").write_text("{")
     with pytest.raises(ConfigError, match=r"broken\.json: expected the record of a run"):
         compare.collect_reference()

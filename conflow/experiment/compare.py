@@ -151,7 +151,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The cells of all tables, the claims, which runs they come from, and how to make the runs of a row again.
+    """The cells of all tables at one preset, the claims, which runs they come from, and how to make a row again.
 
     Attributes:
         commands: what makes a row again, by its name.
@@ -180,22 +180,19 @@ def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
     return _comparison(preset, _grouped(records, lambda one: one.ablation), {})
 
 
-def collect_reference() -> Comparison:
-    """Compare the records under runs/reference/: each ablation at its largest scale, and other readings of the paper.
+def collect_reference() -> list[Comparison]:
+    """Compare the records under runs/reference/, preset by preset from the one of the most training down.
 
     Raises:
-        ConfigError: there are none, or none of an ablation as it is.
+        ConfigError: there are none.
     """
     records = record.from_files()
-    changed = [one for one in records if one.changes()]
-    unchanged = sorted((one for one in records if not one.changes()), key=lambda one: SCALES.index(one.preset))
-    if not unchanged:
-        raise ConfigError(f"reference: expected records without changed settings in {record.FOLDER}, found none")
-    largest = {one.ablation: one.preset for one in unchanged}
-    plain = [one for one in unchanged if one.preset == largest[one.ablation]]
-    presets = " and ".join(sorted({one.preset for one in records}))
-    readings = _grouped(changed, lambda one: _reading(one, largest))
-    return _comparison(presets, _grouped(plain, lambda one: one.ablation), readings)
+    found = []
+    for preset in sorted({one.preset for one in records}, key=SCALES.index, reverse=True):
+        plain = [one for one in records if one.preset == preset and not one.changes()]
+        changed = [one for one in records if one.preset == preset and one.changes()]
+        found.append(_comparison(preset, _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)))
+    return found
 
 
 def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[str, list[Record]]:
@@ -207,21 +204,21 @@ def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[s
     return groups
 
 
-def _reading(one: Record, largest: Mapping[str, str]) -> str:
+def _reading(one: Record) -> str:
     """The name of a row for a changed run: all that sets it apart from the row without changes."""
-    scale = [] if one.preset == largest.get(one.ablation) else [f"preset={one.preset}"]
-    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join([*scale, *one.changes()])}"
+    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join(one.changes())}"
 
 
 def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> Comparison:
     cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *_table_4(runs, readings)]
-    settings = next(iter(runs.get("cgp") or next(iter(runs.values())))).settings
+    rows = dict(runs) | dict(readings)
+    settings = (rows.get("cgp") or next(iter(rows.values())))[0].settings
     differing = {cell.row for cell in cells if cell is not None and cell.paper_p is not None and cell.paper_p < LEVEL}
     return Comparison(
         preset,
         [cell for cell in cells if cell is not None],
-        _claims(runs),
-        {name: [one.run_id for one in of_row] for name, of_row in (dict(runs) | dict(readings)).items()},
+        _claims(runs) if runs else [],
+        {name: [one.run_id for one in of_row] for name, of_row in rows.items()},
         _commands(runs, readings),
         " ".join(f"{key}={settings[key]}" for key in OPEN if key in settings),
         {METHODS[name]: reason for name, reason in REASONS.items() if METHODS[name] in differing},
@@ -241,8 +238,9 @@ def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Reco
             found[f"{name}, {label}"] = f"{again} && {evaluated}"
     if "cgp" in runs:
         found["default"] = _command(runs["cgp"])
-    first = next(iter(runs.values()))[:1]
-    return found | dict.fromkeys(("no model: test data", "no model: feasible test data"), _command(first))
+    for of_row in list(runs.values())[:1]:
+        found |= dict.fromkeys(("no model: test data", "no model: feasible test data"), _command(of_row[:1]))
+    return found
 
 
 def _labels(runs: Sequence[Record]) -> list[str]:

@@ -66,19 +66,21 @@ def checked_format(name: str) -> Format:
     raise ConfigError(f"format={name}: expected one of {', '.join(get_args(Format))}")
 
 
-def render(comparison: Comparison, form: Format, console: Console) -> None:
-    """Print a comparison as a table, Markdown, CSV (the cells) or JSON (everything)."""
+def render(comparisons: Sequence[Comparison], form: Format, console: Console) -> None:
+    """Print comparisons as tables, Markdown, CSV (the cells) or JSON (a list of everything)."""
     if form == "json":
-        console.out(json.dumps(asdict(comparison), indent=1), highlight=False)
+        console.out(json.dumps([asdict(one) for one in comparisons], indent=1), highlight=False)
     elif form == "csv":
-        console.out(csv_text(Cell, comparison.cells), end="", highlight=False)
+        cells = [cell for one in comparisons for cell in one.cells]
+        console.out(csv_text(Cell, cells), end="", highlight=False)
     else:
-        for title, header, rows in _sheets(comparison):
-            if form == "markdown":
-                console.out(markdown(title, header, rows), highlight=False)
-            else:
-                console.print(table(title, header, rows))
-        console.out(f"Unless a row says otherwise: {comparison.reading}", highlight=False)
+        for one in comparisons:
+            for title, header, rows in _sheets(one):
+                if form == "markdown":
+                    console.out(markdown(title, header, rows), highlight=False)
+                else:
+                    console.print(table(title, header, rows))
+            console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
 
 
 def csv_text(kind: Any, rows: Iterable[Any]) -> str:
@@ -114,14 +116,14 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         if number == "2":  # whose columns are the methods
             rows = [row[:-1] for row in rows] + [[AGAIN, *(comparison.commands.get(column, "") for column in columns)]]
         if cells:
-            presets = " and ".join(sorted({cell.preset for cell in cells.values()}))
-            sheets.append((f"{title}, preset {presets}", ["", *columns, *([] if number == "2" else [AGAIN])], rows))
-    claims = [[claim.text, claim.verdict, _p(claim.p), claim.detail] for claim in comparison.claims]
-    sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
+            sheets.append((title, ["", *columns, *([] if number == "2" else [AGAIN])], rows))
+    if comparison.claims:
+        claims = [[claim.text, claim.verdict, _p(claim.p), claim.detail] for claim in comparison.claims]
+        sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
     if comparison.reasons:
         differing = [list(pair) for pair in comparison.reasons.items()]
         sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
-    return sheets
+    return [(f"{title}, preset {comparison.preset}", header, rows) for title, header, rows in sheets]
 
 
 def _p(p: float | None) -> str:
@@ -154,7 +156,7 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> T
     """A table for the terminal."""
     made = Table(title=title, show_lines=True)
     for name in header:
-        made.add_column(name)
+        made.add_column(name, overflow="fold")  # a command that is cut short is none
     for row in rows:
         made.add_row(*(text.replace("[", "\\[") for text in row))
     return made
@@ -163,5 +165,6 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> T
 def markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = [f"**{title}**", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    lines += ["| " + " | ".join(text.replace("\n", "<br>") for text in row) + " |" for row in rows]
+    shown = [[f"`{text}`" if text.startswith("make ") else text.replace("\n", "<br>") for text in row] for row in rows]
+    lines += ["| " + " | ".join(row) + " |" for row in shown]
     return "\n".join(lines) + "\n"
