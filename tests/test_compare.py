@@ -1,4 +1,6 @@
 import json
+import math
+import statistics
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -90,27 +92,49 @@ def test_the_data_are_counted_once_and_the_source_for_every_seed(comparison: Com
 
 
 def test_claims_are_judged_by_exact_tests(comparison: Comparison) -> None:
+    claims = {claim.text: claim for claim in comparison.claims}
     verdicts = {claim.text: (claim.verdict, claim.p) for claim in comparison.claims}
     p = stats.fisher_exact([[86, 3914], [160, 3840]]).pvalue
     assert verdicts["ConFlow collides less than FM, without guidance"] == ("holds", p)
     assert verdicts["naive negatives hurt FM, without guidance"][0] == "not distinguishable"
     assert verdicts["CGP beats Gaussian: collision rate"][0] == "reversed"
     assert verdicts["negatives help ConFlow (none: robot)"] == ("no runs", None)
-    # All four of one side below all four of the other: 2 of the 70 ways to deal eight seeds.
-    assert verdicts["CGP beats Gaussian: smoothness, median"] == ("holds", 2 / 70)
+    # A metric without counts is judged between the seeds.
+    smoothness = claims["CGP beats Gaussian: smoothness, median"]
+    assert (smoothness.verdict, smoothness.p) == ("holds", None)
+    assert smoothness.seeds_p == pytest.approx(welch_p([0.010, 0.011, 0.012, 0.013], [0.100, 0.101, 0.102, 0.103]))
+    rate = claims["CGP beats Gaussian: collision rate"]
+    assert rate.seeds_p == pytest.approx(welch_p([0.020, 0.021, 0.022, 0.023], [0.010] * 4))
 
 
-def test_no_permutation_of_two_seeds_and_two_can_be_significant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def welch_p(a: list[float], b: list[float]) -> float:
+    """t = (mean a - mean b) / sqrt(v_a + v_b), v = s^2 / n, with (v_a + v_b)^2 / sum v^2 / (n - 1) of freedom."""
+    v_a, v_b = (statistics.variance(one) / len(one) for one in (a, b))
+    t = (statistics.mean(a) - statistics.mean(b)) / math.sqrt(v_a + v_b)
+    freedom = (v_a + v_b) ** 2 / (v_a**2 / (len(a) - 1) + v_b**2 / (len(b) - 1))
+    return float(2 * stats.t.sf(abs(t), freedom))
+
+
+def test_one_seed_says_nothing_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.chdir(tmp_path)
-    for seed in range(2):
-        add_run("cgp", seed, 10, 0.01)
-        add_run("gaussian", seed, 10, 0.9 + 0.01 * seed)
+    add_run("cgp", 0, 10, 0.01)
+    add_run("gaussian", 0, 100, 0.9)
+    add_run("gaussian", 1, 100, 0.9)
     claims = {claim.text: claim for claim in compare.collect("smoke").claims}
     found = claims["CGP beats Gaussian: smoothness, median"]
-    assert (found.verdict, found.p) == ("not distinguishable", 2 / 6)
+    assert (found.verdict, found.p, found.seeds_p) == ("too few seeds", None, None)
+    rate = claims["CGP beats Gaussian: collision rate"]
+    assert (rate.verdict, rate.seeds_p) == ("holds", None)  # of these networks, by their counts
+
+
+def test_runs_that_cannot_have_these_arguments_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    add_run("cgp", 0, 10, 0.01, "correction.keep_ends=true")
+    add_run("covariant", 0, 10, 0.01)  # which has no ends to keep
+    found = compare.collect("smoke", ["correction.keep_ends=true"])
+    assert found.runs.keys() == {"cgp"}
 
 
 def rendered(comparison: Comparison, form: report.Format) -> str:
@@ -192,7 +216,7 @@ def test_a_claim_on_a_metric_that_a_run_lacks_says_so(patchy: Comparison) -> Non
     found = claims["CGP beats Gaussian: smoothness, median"]
     assert (found.verdict, found.p) == ("no runs", None)
     assert found.detail == "not all runs of cgp and gaussian have test/none/smoothness_median"
-    assert claims["CGP beats Gaussian: start error per robot"].p is not None
+    assert claims["CGP beats Gaussian: start error per robot"].verdict != "no runs"
 
 
 @pytest.mark.parametrize("form", ["table", "markdown", "csv", "json"])

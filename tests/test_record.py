@@ -8,7 +8,7 @@ from rich.console import Console
 from scipy import stats
 
 from conflow.experiment import compare, record, report, tracking
-from conflow.experiment.config import ConfigError, flatten, load, names
+from conflow.experiment.config import ConfigError, flatten, load
 from conflow.experiment.record import Record
 
 
@@ -49,6 +49,8 @@ def test_a_record_says_what_was_changed_and_nothing_else() -> None:
         "correction.lambda_c=10.0",
         "sample.num=100",
     ]
+    # As an argument again; Python's None is no value of a setting.
+    assert published("spectral", 0, 1, "source.modes=null").changes() == ["source.modes=null"]
 
 
 def test_a_setting_that_came_later_counts_as_its_default() -> None:
@@ -88,7 +90,7 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
     train = 'make ablations ABLATIONS=cgp SEEDS="0 1" PRESET=quick'
     assert found.commands["default"] == train
     assert found.commands["ConFlow (D+ and D-), sample.solver:rk4"] == (
-        f"{train} && for s in 0 1; do make evaluate RUN=cgp-s$s ARGS='sample.solver=rk4'; done"
+        f"{train} && for s in 0 1; do make evaluate RUN=quick/cgp-s$s ARGS='sample.solver=rk4'; done"
     )
     (other,) = (command for command in found.commands.values() if "amplitudes" in command)
     assert other == f"{train} ARGS='data.amplitudes=[0.9,0.15] data.jitter=0.05'"
@@ -96,8 +98,8 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
     with console.capture() as captured:
         report.render([found], "markdown", console)
     lines = captured.get().splitlines()
-    assert any(line.startswith("| default") and line.endswith(f"| {train} |") for line in lines)
-    assert f"| again with | {train.replace('cgp', 'gaussian')} | {train} |" in lines
+    assert any(line.startswith("| default") and line.endswith(f"| `{train}` |") for line in lines)
+    assert f"| again with | `{train.replace('cgp', 'gaussian')}` | `{train}` |" in lines
 
 
 def test_a_narrow_terminal_cuts_no_command_short() -> None:
@@ -134,8 +136,15 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     ]
 
 
-def test_every_preset_has_its_place_among_the_scales() -> None:
-    assert set(compare.SCALES) == set(names("preset"))
+def test_reasons_are_of_the_columns_that_differ() -> None:
+    """In the unguided column alone, in guided ones alone, and in both."""
+    published("cgp", 0, 300)
+    published("no_negatives", 0, 40)  # as the paper's 0.043, and not its 0.004
+    published("fm_mixed", 0, 270)  # guided as the paper's 0.27
+    (found,) = compare.collect_reference()
+    assert found.reasons["ConFlow (D+ and D-)"] == f"{compare.UNGUIDED['cgp']}; {compare.GUIDED}"
+    assert found.reasons["ConFlow (D+)"] == compare.GUIDED
+    assert found.reasons["FM (D+ and D-)"] == compare.UNGUIDED["fm_mixed"]
 
 
 def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:

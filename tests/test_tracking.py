@@ -101,3 +101,27 @@ def test_a_signal_while_the_store_makes_the_run_leaves_no_run_that_says_running(
         for signum, handler in handlers.items():
             signal.signal(signum, handler)
     assert tracking.client().get_run(created[0]).info.status == "KILLED"
+
+
+def test_a_run_is_found_by_its_id_its_name_or_its_preset_and_name(store_folder: Path) -> None:
+    """At another preset a run has the same name; the newest is meant, unless the preset is named."""
+    store = tracking.client()
+    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    assert experiment is not None
+    made: dict[str, str] = {}
+    for preset in ("quick", "long"):
+        run = store.create_run(experiment.experiment_id, run_name="cgp-s0", tags={"preset": preset})
+        store.set_terminated(run.info.run_id, "FINISHED")
+        made[preset] = str(run.info.run_id)
+    wanted = {
+        "quick/cgp-s0": "quick",
+        "long/cgp-s0": "long",
+        "cgp-s0": "long",
+        "latest": "long",
+        made["quick"]: "quick",
+    }
+    assert {name: str(tracking.find_run(name).info.run_id) for name in wanted} == {
+        name: made[preset] for name, preset in wanted.items()
+    }
+    with pytest.raises(config.ConfigError, match="run=paper/cgp-s0: no such finished run"):
+        tracking.find_run("paper/cgp-s0")

@@ -8,12 +8,12 @@ from typing import Literal
 
 from scipy import stats
 
-from conflow.experiment import record
+from conflow.experiment import config, record
 from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
 from conflow.experiment.record import Record
 
-Verdict = Literal["holds", "reversed", "not distinguishable", "no runs"]
+Verdict = Literal["holds", "reversed", "not distinguishable", "too few seeds", "no runs"]
 LEVEL = 0.05
 """Claims are tested at this level, two-sided."""
 
@@ -33,8 +33,6 @@ METHODS = {
     "few_steps": "few solver steps",
     "plus": "plus: the best together",
 }
-SCALES = ("smoke", "quick", "long", "paper")
-"""The presets, by how much is trained."""
 SOURCES = ("cgp", "gaussian", "gp", "spectral", "fitted", "plus")
 """The ablations whose sources differ."""
 COLLISIONS = {
@@ -92,17 +90,19 @@ PAPER_2 = {
 }
 
 
-# Why a row differs from the paper's, most likely, and where to see it.
-REASONS = {
-    "cgp": "too few steps: the filter pushes x_t to where the source has no mass (make explain: support), and the "
-    "network learns only late to lead it back; trained for as many steps as the paper's it does (Table 4)",
-    "no_negatives": "guidance at the paper's weights does little: what it pushes in mid-flow the flow pulls back, and "
-    "half of the demonstrations pass through the obstacle (make figures: guidance, guidance_weight)",
-    "fm": "from a standard normal the ends and the smoothness have to be learned, which this scale does not do (start "
-    "error in Table 2), and feasibility with them; guidance as for ConFlow (D+)",
+# Why a row differs from the paper's, most likely, and where to see it: without guidance, and guided.
+UNGUIDED = {
+    "cgp": "too short a training: the filter pushes x_t to where the source has no mass (make explain: support), and "
+    "the network learns only late to bring it back; preset long is long enough",
+    "fm": "from a standard normal the ends and the smoothness have to be learned (start error of the Gaussian source "
+    "in Table 2), and feasibility with them",
     "fm_mixed": "a model of demonstrations of which 30 % collide cannot give the paper's 0.055 unguided: its cells for "
-    "no and for robot guidance look exchanged; guidance as for ConFlow (D+)",
+    "no and for robot guidance look exchanged",
 }
+GUIDED = (
+    "guidance at the paper's weights does little: what it pushes in mid-flow the flow pulls back, and half of the "
+    "demonstrations pass through the obstacle (make figures: guidance, guidance_weight)"
+)
 OPEN = (
     *("constraint.reduction", "correction.smoothing", "correction.edges", "correction.keep_ends", "correction.mask"),
     *("network.sees_ends", "sample.solver", "sample.steps", "sample.radius", "data.amplitudes", "data.jitter"),
@@ -138,14 +138,26 @@ class Cell:
     preset: str
     paper_p: float | None
 
+    @property
+    def differs(self) -> bool:
+        """Whether this is another rate than the paper's."""
+        return self.paper_p is not None and self.paper_p < LEVEL
+
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence, and what the runs say to it."""
+    """A sentence "a is lower than b", and what the runs say to it.
+
+    Attributes:
+        verdict: of a rate by Fisher's exact test on the counts, else by the test between seeds.
+        p: of Fisher's exact test, of a rate. It speaks of the networks that were trained, not of others.
+        seeds_p: of Welch's t test on the values of the seeds; none where there are too few to have a spread.
+    """
 
     text: str
     verdict: Verdict
     p: float | None
+    seeds_p: float | None
     detail: str
 
 
@@ -188,11 +200,17 @@ def collect_reference() -> list[Comparison]:
     """
     records = record.from_files()
     found = []
-    for preset in sorted({one.preset for one in records}, key=SCALES.index, reverse=True):
+    for preset in sorted({one.preset for one in records}, key=_scale, reverse=True):
         plain = [one for one in records if one.preset == preset and not one.changes()]
         changed = [one for one in records if one.preset == preset and one.changes()]
         found.append(_comparison(preset, _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)))
     return found
+
+
+def _scale(preset: str) -> int:
+    """How much is computed in a training at a preset, about."""
+    settings = config.load([f"preset={preset}"])
+    return settings.train.max_steps * settings.train.batch_size * settings.network.hidden**2
 
 
 def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[str, list[Record]]:
@@ -213,7 +231,6 @@ def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping
     cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *_table_4(runs, readings)]
     rows = dict(runs) | dict(readings)
     settings = (rows.get("cgp") or next(iter(rows.values())))[0].settings
-    differing = {cell.row for cell in cells if cell is not None and cell.paper_p is not None and cell.paper_p < LEVEL}
     return Comparison(
         preset,
         [cell for cell in cells if cell is not None],
@@ -221,8 +238,21 @@ def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping
         {name: [one.run_id for one in of_row] for name, of_row in rows.items()},
         _commands(runs, readings),
         " ".join(f"{key}={settings[key]}" for key in OPEN if key in settings),
-        {METHODS[name]: reason for name, reason in REASONS.items() if METHODS[name] in differing},
+        _reasons(cells),
     )
+
+
+def _reasons(cells: Iterable[Cell | None]) -> dict[str, str]:
+    """The most likely reasons of the rows that differ from the paper's."""
+    none, *_ = COLLISIONS.values()
+    found: dict[str, str] = {}
+    for ablation, row in METHODS.items():
+        differing = {cell.column for cell in cells if cell is not None and cell.row == row and cell.differs}
+        reasons = [UNGUIDED[ablation]] if none in differing and ablation in UNGUIDED else []
+        reasons += [GUIDED] if differing - {none} else []
+        if reasons:
+            found[row] = "; ".join(reasons)
+    return found
 
 
 def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> dict[str, str]:
@@ -233,8 +263,8 @@ def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Reco
         found |= {name: again, f"no model: source {ablation}": again}
         seeds = " ".join(str(one.seed) for one in of_row)
         for label in _labels(of_row):
-            arguments = label.replace(":", "=")
-            evaluated = f"for s in {seeds}; do make evaluate RUN={ablation}-s$s ARGS='{arguments}'; done"
+            arguments = "" if label == record.UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
+            evaluated = f"for s in {seeds}; do make evaluate RUN={of_row[0].preset}/{ablation}-s$s{arguments}; done"
             found[f"{name}, {label}"] = f"{again} && {evaluated}"
     if "cgp" in runs:
         found["default"] = _command(runs["cgp"])
@@ -325,23 +355,30 @@ def _cell(table: str, row: str, column: str, paper: float | None, metric: str, r
     """The number, or None where a run lacks the metric."""
     if not runs or not _measured(metric, runs):
         return None
-    trajectories = [int(run.metrics[metric.rsplit("/", 1)[0] + "/num"]) for run in runs]
-    count, low, high = None, None, None
+    values, trajectories = _values(metric, runs), sum(_trajectories(metric, run) for run in runs)
+    value, count, low, high, paper_p = statistics.mean(values), None, None, None, None
     if f"{metric}_count" in runs[0].metrics:
-        counts = [int(run.metrics[f"{metric}_count"]) for run in runs]
-        values = [of_seed / total for of_seed, total in zip(counts, trajectories, strict=True)]
-        count = sum(counts)
-        value = count / sum(trajectories)
-        low, high = wilson(count, sum(trajectories))
-    else:
-        values = [run.metrics[metric] for run in runs]
-        value = statistics.mean(values)
-    paper_p = None
-    if paper is not None and count is not None and table == "1":
-        of_paper = round(paper * PAPER_TRAJECTORIES)
-        paper_p = _fisher_p(count, sum(trajectories), of_paper, PAPER_TRAJECTORIES)
-    across = (min(values), max(values), len(runs), count, sum(trajectories), runs[0].preset, paper_p)
+        count = sum(int(run.metrics[f"{metric}_count"]) for run in runs)
+        value = count / trajectories
+        low, high = wilson(count, trajectories)
+        if paper is not None and table == "1":
+            paper_p = _fisher_p(count, trajectories, round(paper * PAPER_TRAJECTORIES), PAPER_TRAJECTORIES)
+    across = (min(values), max(values), len(runs), count, trajectories, runs[0].preset, paper_p)
     return Cell(table, row, column, paper, value, low, high, *across)
+
+
+def _values(metric: str, runs: Sequence[Record]) -> list[float]:
+    """The metric of each run, a rate from its count."""
+    return [
+        run.metrics[f"{metric}_count"] / _trajectories(metric, run)
+        if f"{metric}_count" in run.metrics
+        else run.metrics[metric]
+        for run in runs
+    ]
+
+
+def _trajectories(metric: str, run: Record) -> int:
+    return int(run.metrics[metric.rsplit("/", 1)[0] + "/num"])
 
 
 def _claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
@@ -363,34 +400,32 @@ def _claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
         ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
     ]
     return [
-        *(_compare(runs, *claim, _fisher) for claim in rates),
-        *(_compare(runs, f"CGP beats Gaussian: {row}", "cgp", "gaussian", key, _permutation) for key, row in others),
-        *(_compare(runs, *claim, _fisher) for claim in ours),
+        *(_compare(runs, *claim) for claim in rates),
+        *(_compare(runs, f"CGP beats Gaussian: {row}", "cgp", "gaussian", key) for key, row in others),
+        *(_compare(runs, *claim) for claim in ours),
     ]
 
 
-Test = Callable[[str, Sequence[Record], Sequence[Record]], tuple[float, float, float]]
-
-
-def _compare(runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str, test: Test) -> Claim:
+def _compare(runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str) -> Claim:
     if lower not in runs or higher not in runs:
         missing = " and ".join(name for name in (lower, higher) if name not in runs)
-        return Claim(text, "no runs", None, f"no finished run of {missing}")
-    if not _measured(metric, [*runs[lower], *runs[higher]]):
-        return Claim(text, "no runs", None, f"not all runs of {lower} and {higher} have {metric}")
-    a, b, p = test(metric, runs[lower], runs[higher])
-    verdict: Verdict = "not distinguishable" if p >= LEVEL or a == b else "holds" if a < b else "reversed"
-    return Claim(text, verdict, p, f"{a:.4f} against {b:.4f}, {len(runs[lower])} and {len(runs[higher])} seeds")
+        return Claim(text, "no runs", None, None, f"no finished run of {missing}")
+    a, b = (_cell("", "", "", None, metric, runs[name]) for name in (lower, higher))
+    if a is None or b is None:
+        return Claim(text, "no runs", None, None, f"not all runs of {lower} and {higher} have {metric}")
+    seeds_p = _welch_p(_values(metric, runs[lower]), _values(metric, runs[higher]))
+    p = None
+    if a.count is not None and b.count is not None:
+        p = _fisher_p(a.count, a.trajectories, b.count, b.trajectories)
+    detail = f"{a.value:.4f} against {b.value:.4f}, {a.seeds} and {b.seeds} seeds"
+    return Claim(text, _verdict(a.value, b.value, seeds_p if p is None else p), p, seeds_p, detail)
 
 
-def _fisher(metric: str, lower: Sequence[Record], higher: Sequence[Record]) -> tuple[float, float, float]:
-    """Both pooled rates, and the p of Fisher's exact test on the counts."""
-    a, b = (_cell("", "", "", None, metric, runs) for runs in (lower, higher))
-    assert a is not None
-    assert b is not None
-    assert a.count is not None
-    assert b.count is not None
-    return a.value, b.value, _fisher_p(a.count, a.trajectories, b.count, b.trajectories)
+def _verdict(a: float, b: float, p: float | None) -> Verdict:
+    """On "a is lower than b"."""
+    if p is None:
+        return "too few seeds"
+    return "not distinguishable" if p >= LEVEL or a == b else "holds" if a < b else "reversed"
 
 
 def _fisher_p(count: int, trajectories: int, other_count: int, other_trajectories: int) -> float:
@@ -398,15 +433,9 @@ def _fisher_p(count: int, trajectories: int, other_count: int, other_trajectorie
     return float(stats.fisher_exact(table).pvalue)
 
 
-def _permutation(metric: str, lower: Sequence[Record], higher: Sequence[Record]) -> tuple[float, float, float]:
-    """Both means over seeds, and the p of the exact test that permutes the seeds between the two."""
-    values = [[run.metrics[metric] for run in runs] for runs in (lower, higher)]
-    a, b = map(statistics.mean, values)
-    pooled = values[0] + values[1]
-    observed = abs(a - b)
-    differences = []
-    for chosen in itertools.combinations(range(len(pooled)), len(values[0])):
-        first = sum(pooled[i] for i in chosen)
-        differences.append(abs(first / len(values[0]) - (sum(pooled) - first) / len(values[1])))
-    # Relative slack: the observed split must count as itself, whatever the order of summation.
-    return a, b, sum(d >= observed * (1 - 1e-9) for d in differences) / len(differences)
+def _welch_p(a: Sequence[float], b: Sequence[float]) -> float | None:
+    """The p of Welch's t test, or None where one side is a single value or neither has a spread."""
+    if min(len(a), len(b)) < 2 or len(set(a)) == len(set(b)) == 1:
+        return None
+    moments = [moment for side in (a, b) for moment in (statistics.mean(side), statistics.stdev(side), len(side))]
+    return float(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue)

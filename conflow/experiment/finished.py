@@ -6,7 +6,7 @@ from pathlib import Path
 from mlflow.entities import Run
 from rich.console import Console
 
-from conflow.experiment import checkpoints, report, tracking
+from conflow.experiment import checkpoints, record, report, tracking
 from conflow.experiment import config as configuration
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
@@ -72,7 +72,7 @@ def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> N
     run = tracking.find_run(wanted)
     model = load_model(tracking.artifact(run, MODEL_FILE), arguments)
     # MLflow allows no = in a metric's name.
-    label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or "same settings"
+    label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or record.UNCHANGED
     data = demonstrations(run, model.config)
     with ProgressDisplay(console) as display:
         evaluation = evaluate(model, data.test.x, display)

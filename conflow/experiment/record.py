@@ -13,6 +13,8 @@ from conflow.experiment.config import ConfigError, flatten
 
 FOLDER = tracking.RUNS / "reference" / "runs"
 PUBLISHED = ("test/", "without_model/", "source/", "evaluate/")
+UNCHANGED = "same settings"
+"""The label of a run that was sampled again as it is."""
 ORIGIN = ("git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
 
 
@@ -72,7 +74,8 @@ class Record:
     def changes(self) -> list[str]:
         """The settings that are not those of the ablation at the preset, as arguments."""
         named = flatten(config.load([f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]).tree())
-        return [f"{key}={value}" for key, value in self.settings.items() if value != str(named.get(key, value))]
+        changed = {key: value for key, value in self.settings.items() if value != str(named.get(key, value))}
+        return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
 
 
 def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
@@ -82,7 +85,10 @@ def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
         ablation, seed = run.data.tags["ablation"], int(run.data.tags["seed"])
         if ablation not in config.names("ablation"):
             continue
-        asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
+        try:
+            asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
+        except ConfigError:
+            continue  # the arguments do not go with this ablation, so nobody has trained it with them
         if run.data.tags["config_sha"] == asked.sha():
             newest.setdefault((ablation, seed), Record.of(run))
     return sorted(newest.values(), key=lambda record: record.seed)

@@ -10,7 +10,7 @@ from typing import Any, Literal, cast, get_args
 from rich.console import Console
 from rich.table import Table
 
-from conflow.experiment.compare import COLLISIONS, GUARDS, LEVEL, QUALITIES, READINGS, SMOOTHNESS, Cell, Comparison
+from conflow.experiment.compare import COLLISIONS, GUARDS, QUALITIES, READINGS, SMOOTHNESS, Cell, Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.evaluation import Metrics
 from conflow.experiment.module import Setting
@@ -118,8 +118,9 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         if cells:
             sheets.append((title, ["", *columns, *([] if number == "2" else [AGAIN])], rows))
     if comparison.claims:
-        claims = [[claim.text, claim.verdict, _p(claim.p), claim.detail] for claim in comparison.claims]
-        sheets.append(("Claims, the paper's first", ["claim", "verdict", "exact test", "values"], claims))
+        claims = [[one.text, one.verdict, _p(one.p), _p(one.seeds_p), one.detail] for one in comparison.claims]
+        header = ["claim", "verdict", "exact test on the counts", "t test between seeds", "values"]
+        sheets.append(("Claims, the paper's first", header, claims))
     if comparison.reasons:
         differing = [list(pair) for pair in comparison.reasons.items()]
         sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
@@ -147,7 +148,7 @@ def _text(cell: Cell) -> str:
     if cell.seeds > 1:
         parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
     if cell.paper is not None:
-        agrees = "" if cell.paper_p is None else ", differs" if cell.paper_p < LEVEL else ", not distinguishable"
+        agrees = "" if cell.paper_p is None else ", differs" if cell.differs else ", not distinguishable"
         parts.append(f"paper {cell.paper:.4g}{agrees}")
     return "\n".join(parts)
 

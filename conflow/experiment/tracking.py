@@ -137,14 +137,15 @@ def _relocate(old: str, new: str) -> None:
 
 
 def find_run(wanted: str) -> Run:
-    """The run with this id, or the newest finished one of this name, or of any for "latest".
+    """The run with this id, or the newest finished one of this name or PRESET/NAME, or of any for "latest".
 
     Raises:
         ConfigError: there is none.
     """
     finished = runs("FINISHED")
     for run in finished:
-        if wanted in ("latest", run.info.run_id, run.info.run_name):
+        name = run.info.run_name
+        if wanted in ("latest", run.info.run_id, name, f"{run.data.tags.get('preset')}/{name}"):
             return run
     known = sorted({str(run.info.run_name) for run in finished})
     raise ConfigError(
