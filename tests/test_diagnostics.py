@@ -34,19 +34,20 @@ def side_by_side(distance: float, batch: int = 3) -> torch.Tensor:
     return torch.tensor([distance / 2, 0, -distance / 2, 0]).expand(batch, 32, 4)
 
 
-def test_without_guidance_a_constant_field_only_moves_the_trajectories() -> None:
+@pytest.mark.parametrize("gamma", [10, 25])
+def test_without_guidance_a_constant_field_only_moves_the_trajectories(gamma: int) -> None:
     """C(x_0 + t v) at every t, for a velocity v that carries both robots towards the obstacle."""
-    flow, x_0 = constant(0.4), side_by_side(0.2)
+    flow, x_0 = constant(0.4, f"constraint.gamma={gamma}"), side_by_side(0.2)
     found = guidance(flow, "none", x_0)
     assert found.t.tolist() == pytest.approx([k / STEPS for k in range(STEPS + 1)])
     assert found.ratio.tolist() == [0] * (STEPS + 1)
     assert (found.start_drift, found.end_drift) == (0, 0)
     # The same distance at all 32 waypoints and all times, and clearances of discs of 0.15 to one of 0.1 at (0, 0.5).
-    robots = 32 * -math.log1p(math.exp(-10 * (0.2 - 0.3))) / 10
+    robots = 32 * -math.log1p(math.exp(-gamma * (0.2 - 0.3))) / gamma
     assert found.robot_barrier.tolist() == pytest.approx([robots] * (STEPS + 1), rel=1e-4)  # float32
     for t, value in zip(found.t.tolist(), found.obstacle_barrier.tolist(), strict=True):
         gap = min(math.dist((x + 0.4 * t, 0.4 * t), (0, 0.5)) for x in (-0.1, 0.1)) - 0.25
-        assert value == pytest.approx(32 * -math.log1p(math.exp(-10 * gap)) / 10, rel=1e-4)
+        assert value == pytest.approx(32 * -math.log1p(math.exp(-gamma * gap)) / gamma, rel=1e-4)
 
 
 def test_the_ratio_is_the_guidance_over_the_velocity() -> None:

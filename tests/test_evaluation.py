@@ -8,6 +8,7 @@ from rich.console import Console
 from torch import Tensor
 
 from conflow.experiment import config, report
+from conflow.experiment.datamodule import Split
 from conflow.experiment.evaluation import Evaluation, evaluate
 from conflow.experiment.module import SETTINGS, ConFlow
 from conflow.experiment.progress import ProgressDisplay
@@ -19,9 +20,10 @@ def model() -> ConFlow:
     return ConFlow(config.load(["preset=smoke", "sample.steps=1"]), 32, 4).eval()
 
 
-def evaluated(demonstrations: Tensor) -> Evaluation:
+def evaluated(demonstrations: Tensor, M: Tensor | None = None) -> Evaluation:
+    M = violates(demonstrations) if M is None else M
     with ProgressDisplay(Console(file=io.StringIO())) as display:
-        return evaluate(model(), demonstrations, display)
+        return evaluate(model(), Split(demonstrations, M), display)
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +67,14 @@ def test_the_distance_of_the_demonstrations_to_their_feasible_part_is_that_of_th
     found = evaluation.baseline["data"]
     assert found["energy_distance"] == pytest.approx(2 * cross - within - within_feasible, rel=1e-6)
     assert found["energy_distance_low"] < found["energy_distance"] < found["energy_distance_high"]
+
+
+def test_feasible_is_what_is_labelled_so() -> None:
+    """A user's labels, or those of another radius than samples are judged at."""
+    x = swap(200)
+    M = torch.arange(200) % 2 == 0
+    found = evaluated(x, M).baseline["feasible"]
+    assert (found["num"], found["robot_collision_count"]) == (100, int(violates(x[~M]).sum()))
 
 
 @pytest.mark.parametrize(("feasible", "infeasible", "has"), [(0, 5, set()), (1, 5, set()), (5, 1, {"source"})])

@@ -45,7 +45,8 @@ def fitted(settings: Config, demonstrations: Tensor) -> Config:
 
 def judge(settings: Config, D: int) -> Constraint:
     """The constraint that samples are judged by."""
-    return RobotAvoidance(PointRobots(D // 2), settings.sample.radius or settings.constraint.radius)
+    radius = settings.sample.radius or settings.constraint.radius
+    return RobotAvoidance(PointRobots(D // 2), radius, _barrier(settings.constraint))
 
 
 def robot_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:

@@ -127,11 +127,15 @@ class DemonstrationData(LightningDataModule):
             train_split, val_split = train_split.feasible(), val_split.feasible()
         if data.repair:
             train_split, val_split = self._repaired(train_split), self._repaired(val_split)
-        for part, split in {"training": train_split, "validation": val_split, "test": test_split}.items():
-            if not len(split.x):
-                raise DemonstrationError(
-                    f"{name}: no trajectory is left for {part} out of {len(self.x)}, expected one or more"
-                )
+        # Of a single test trajectory there is no diversity.
+        for part, split, needed in (
+            ("training", train_split, 1),
+            ("validation", val_split, 1),
+            ("test", test_split, 2),
+        ):
+            if len(split.x) < needed:
+                left = f"{len(split.x)} trajectories are left for {part} out of {len(self.x)}"
+                raise DemonstrationError(f"{name}: {left}, expected {needed} or more")
         return train_split, val_split, test_split
 
     def _repaired(self, split: Split) -> Split:

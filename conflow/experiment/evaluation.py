@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from conflow.experiment.build import random_stream
+from conflow.experiment.datamodule import Split
 from conflow.experiment.metrics import EnergyDistance, endpoint_error, trajectory_metrics
 from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
 from conflow.experiment.progress import ProgressDisplay
@@ -43,16 +44,15 @@ class Evaluation:
 
 
 @torch.inference_mode()
-def evaluate(model: ConFlow, demonstrations: Tensor, display: ProgressDisplay) -> Evaluation:
+def evaluate(model: ConFlow, split: Split, display: ProgressDisplay) -> Evaluation:
     """Sample `sample.num` trajectories under every setting and measure them.
 
-    Each gets the start and goal of a demonstration (N, T, D), the first again after the last. All settings start
-    from the same x_0, which depends on the seed alone, so they differ by their guidance only. D+ of the demonstrations
-    is what the energy distance is taken to.
+    Each gets the start and goal of a demonstration of the split, the first again after the last. All settings start
+    from the same x_0, which depends on the seed alone, so they differ by their guidance only. D+ of the split, by its
+    labels, is what the energy distance is taken to.
     """
     task = display.add("sampling", len(SETTINGS))
-    demonstrations = demonstrations.to(model.device)
-    violates = model.robots.violation(demonstrations)
+    demonstrations, violates = split.x.to(model.device), split.violates.to(model.device)
     feasible = demonstrations[~violates]
     reference = feasible if len(feasible) > 1 else None  # one has no distance to another
     x_1 = cycle(demonstrations, model.config.sample.num)

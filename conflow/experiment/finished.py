@@ -75,7 +75,7 @@ def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> N
     label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or record.UNCHANGED
     data = demonstrations(run, model.config)
     with ProgressDisplay(console) as display:
-        evaluation = evaluate(model, data.test.x, display)
+        evaluation = evaluate(model, data.test, display)
     logger = tracking.RunLogger(tracking.client(), run.info.run_id)
     logger.log_metrics(evaluation.keyed(f"evaluate/{label}/", baseline=False), 0)
     logger.save()

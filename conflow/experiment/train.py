@@ -54,11 +54,13 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
                 loop.fit(model, data, ckpt_path=checkpoint)
             except DivergedError as error:
                 raise DivergedError(f"{error}; {_last_good(run_id)}") from None
-            evaluation = evaluate(model.eval(), data.test.x, display)
+            # Lightning leaves the model on the CPU.
+            evaluation = evaluate(model.eval().to(loop.strategy.root_device), data.test, display)
         # One value a run: at step 0 MLflow draws bars that compare runs, at any other a line of one point.
         logger.log_metrics(evaluation.keyed(), 0)
         with tempfile.TemporaryDirectory() as folder:
             loop.save_checkpoint(Path(folder, MODEL_FILE), weights_only=True)
+            model.cpu()  # as what was sampled
             pictures = {
                 "page": figures.page(model, data, evaluation),
                 "demonstrations": figures.demonstrations(data),

@@ -226,7 +226,11 @@ FILES: dict[str, tuple[bytes, str]] = {
     "one trajectory": (written(x=X[:1]), "no trajectory for training is feasible out of 1, expected D+ too"),
     "three trajectories": (
         written(x=X[:3], violates=np.array([True, False, False])),
-        "no trajectory is left for validation out of 3, expected one or more",
+        "0 trajectories are left for validation out of 3, expected 1 or more",
+    ),
+    "ten trajectories": (
+        written(x=X[:10], violates=np.arange(10) % 2 == 0),
+        "1 trajectories are left for test out of 10, expected 2 or more",
     ),
     "objects": (written(x=np.array([{1: 2}], dtype=object)), NUMERIC),
     "complex": (written(x=X * 1j), "x holds complex64, expected floating-point numbers"),
