@@ -16,6 +16,7 @@ from conflow.scene.constraint import (
     ObstacleAvoidance,
     Reduction,
     RobotAvoidance,
+    Sum,
 )
 from conflow.scene.robots import PointRobots
 
@@ -29,7 +30,7 @@ CONSTRAINTS: dict[str, tuple[PointRobots, Callable[[Barrier], Constraint]]] = {
     "three robots, three obstacles": (THREE, lambda barrier: ObstacleAvoidance(THREE, OBSTACLES, 0.15, barrier)),
     "robots and obstacles": (
         THREE,
-        lambda barrier: RobotAvoidance(THREE, 0.3, barrier) + ObstacleAvoidance(THREE, OBSTACLES, 0.15, barrier),
+        lambda barrier: Sum([RobotAvoidance(THREE, 0.3, barrier), ObstacleAvoidance(THREE, OBSTACLES, 0.15, barrier)]),
     ),
 }
 
@@ -246,7 +247,7 @@ def test_a_sum_adds_barriers_and_violates_where_any_term_does() -> None:
     """C and grad C add up, the clearance is the smallest, M is 'or'; a sum is again a constraint."""
     robots, obstacle = RobotAvoidance(TWO, 0.5), ObstacleAvoidance(TWO, OBSTACLES, 0.1)
     x = trajectories(T=2)
-    both = robots + obstacle
+    both = Sum([robots, obstacle])
     a, b = robots.violation(x), obstacle.violation(x)
     assert len(torch.stack([a, b], dim=1).unique(dim=0)) == 4  # every combination occurs
     assert torch.equal(both.violation(x), a | b)
@@ -254,7 +255,7 @@ def test_a_sum_adds_barriers_and_violates_where_any_term_does() -> None:
     assert torch.equal(both.barrier(x), robots.barrier(x) + obstacle.barrier(x))
     assert torch.equal(both.gradient(x), robots.gradient(x) + obstacle.gradient(x))
     # Another order of addition rounds differently.
-    torch.testing.assert_close((both + robots).gradient(x), 2 * robots.gradient(x) + obstacle.gradient(x))
+    torch.testing.assert_close(Sum([both, robots]).gradient(x), 2 * robots.gradient(x) + obstacle.gradient(x))
 
 
 def test_a_trajectory_that_is_not_finite_is_not_called_feasible() -> None:

@@ -253,6 +253,22 @@ def test_the_interval_of_the_energy_distance_covers_it(shift: float, covered: tu
     assert fmean(values) == pytest.approx(truth, abs=4 * stdev(values) / math.sqrt(len(values)))
 
 
+@pytest.mark.parametrize("name", ["diversity", "start_error"])
+def test_the_intervals_of_means_cover_them(name: str) -> None:
+    """Standard normals in the plane: two are sqrt(pi) apart on average, and sqrt(pi / 2) from the origin."""
+    truth = {"diversity": math.sqrt(math.pi), "start_error": math.sqrt(math.pi / 2)}[name]
+    generator = torch.Generator().manual_seed(0)
+    covered = []
+    for _ in range(400):
+        x = torch.randn(200, 1, 2, generator=generator)
+        metric = Diversity() if name == "diversity" else EndpointError(name, 0)
+        metric.update(x) if isinstance(metric, Diversity) else metric.update(x, torch.zeros_like(x))
+        result = metric.compute()
+        covered.append(result[f"{name}_low"] <= truth <= result[f"{name}_high"])
+    # 0.95 within four standard deviations of a share of 400; half the width would cover two thirds.
+    assert 0.905 < fmean(covered) <= 0.99
+
+
 def test_the_energy_distance_grows_with_a_shift() -> None:
     x, y = swap(400, seed=1), swap(300, seed=2)
     shifted = [energy(x + shift, y)["energy_distance"] for shift in (0.0, 0.05, 0.1, 0.2)]

@@ -229,10 +229,13 @@ def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: 
     assert torch.equal(flow.source.observe(x), flow.source.observe(x_1))
 
 
-def test_guidance_of_plus_acts_where_its_training_does() -> None:
+@pytest.mark.parametrize("t", [0.0, 0.5, 1.0])
+def test_guidance_of_plus_acts_where_its_training_does(t: float) -> None:
     """v + lambda t u^c(x + (1 - t) v): nothing at t = 0, the plain guidance at t = 1."""
     flow = model("ablation=plus", "source.fit=false")
-    x, field = swap(50), flow.field("robot")
-    assert torch.equal(field(x, torch.zeros(50)), flow.v(x, torch.zeros(50)))
-    expected = flow.v(x, torch.ones(50)) + flow.config.sample.robot_weight * flow.u_c(x)
-    torch.testing.assert_close(field(x, torch.ones(50)), expected)
+    torch.nn.init.normal_(flow.v.outlet.weight, std=0.1)  # so that the predicted end is elsewhere than x
+    x, times = swap(50), torch.full((50,), t)
+    v, weight = flow.v(x, times), flow.config.sample.robot_weight
+    pushed = t * flow.u_c(x + (1 - t) * v)
+    assert bool(pushed.any()) == (t > 0)
+    torch.testing.assert_close(flow.field("robot")(x, times), v + weight * pushed)

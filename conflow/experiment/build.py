@@ -15,16 +15,13 @@ from conflow.flow.source import Source
 from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance
 from conflow.scene.robots import PointRobots
 
-CONDITIONED: dict[config.SourceKind, tuple[int, ...]] = {"gaussian": (), "gp": (), "cgp": source.ENDPOINTS}
-"""The waypoints at which each kind of source is conditioned."""
-
 
 def build_source(settings: config.Source, T: int) -> Source:
     """The source p_0 on T waypoints."""
     if settings.kind == "gaussian":
-        return Source(torch.eye(T), modes=settings.modes)
-    K = source.rbf(T, settings.length_scale, settings.sigma_f, settings.epsilon)
-    return Source(K, CONDITIONED[settings.kind], modes=settings.modes)
+        return source.gaussian(T, settings.modes)
+    process = source.cgp if settings.kind == "cgp" else source.gp
+    return process(T, settings.length_scale, settings.sigma_f, settings.epsilon, settings.modes)
 
 
 def fitted(settings: Config, demonstrations: Tensor) -> Config:
@@ -35,7 +32,7 @@ def fitted(settings: Config, demonstrations: Tensor) -> Config:
     """
     if not settings.source.fit:
         return settings
-    index = CONDITIONED[settings.source.kind]
+    index = build_source(settings.source, demonstrations.shape[1]).index.tolist()
     try:
         length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.source.epsilon)
     except ValueError as error:

@@ -21,7 +21,8 @@ class Guidance:
 
     Attributes:
         t: flow time.
-        ratio: |lambda u^c(x_t)| / |v(x_t, t)|, both the norm over the whole batch, i.e. the ratio of root mean squares.
+        ratio: |g| / |v(x_t, t)| with g what guidance adds to v, lambda u^c(x_t) or that at the predicted end; both the
+            norm over the whole batch, i.e. the ratio of root mean squares.
         robot_barrier: mean over the batch of the robots' barrier C(x_t), in workspace units.
         obstacle_barrier: that of the obstacle's barrier.
         start_drift: distance between the guided and the unguided x_1 of the same x_0 at the start, mean over robots and

@@ -1,5 +1,6 @@
 """Every ablation for every seed: which cells are finished, which are to do, and a process for each that is."""
 
+import contextlib
 import math
 import os
 import queue
@@ -95,8 +96,9 @@ def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
                 busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
                 display.update(task, math.floor(10 * sum(cell.share for cell in cells)) / 10, busy)
         except BaseException:
-            while not waiting.empty():
-                waiting.get()
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    waiting.get_nowait()
             for process in list(processes):
                 process.terminate()  # each marks its own run KILLED
             for thread in threads:

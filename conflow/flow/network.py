@@ -105,7 +105,7 @@ class SpectralMLP(nn.Module):
         nn.init.zeros_(self.outlet.bias)
 
     def fit(self, x_1: Tensor) -> None:
-        """Set sigma_1^2 to the second moments of demonstrations x_1 (N, T, D)."""
+        """Set sigma_1^2 to the second moments of demonstrations x_1 (N, T, D) about W x_O, at least rounding's size."""
         self.variance = self.coordinates(x_1).square().mean(dim=0).clamp_min(torch.finfo(x_1.dtype).eps)
 
     def coordinates(self, x: Tensor) -> Tensor:

@@ -108,19 +108,23 @@ def rbf(T: int, length_scale: float | Tensor, sigma_f: float | Tensor, epsilon: 
     return sigma_f**2 * torch.exp(-squares / (2 * length_scale**2)) + epsilon * torch.eye(T, dtype=torch.float64)
 
 
-def gaussian(T: int) -> Source:
+def gaussian(T: int, modes: int | None = None) -> Source:
     """The standard normal N(0, I): independent waypoints, conditioned on nothing."""
-    return Source(torch.eye(T))
+    return Source(torch.eye(T), modes=modes)
 
 
-def gp(T: int, length_scale: float = 0.4, sigma_f: float = 1.0, epsilon: float = 1e-6) -> Source:
+def gp(
+    T: int, length_scale: float = 0.4, sigma_f: float = 1.0, epsilon: float = 1e-6, modes: int | None = None
+) -> Source:
     """p_GP: the RBF process, conditioned on nothing."""
-    return Source(rbf(T, length_scale, sigma_f, epsilon))
+    return Source(rbf(T, length_scale, sigma_f, epsilon), modes=modes)
 
 
-def cgp(T: int, length_scale: float = 0.4, sigma_f: float = 1.0, epsilon: float = 1e-6) -> Source:
+def cgp(
+    T: int, length_scale: float = 0.4, sigma_f: float = 1.0, epsilon: float = 1e-6, modes: int | None = None
+) -> Source:
     """p_CGP: the RBF process, conditioned on start and goal (Eq. GP_source_dist)."""
-    return Source(rbf(T, length_scale, sigma_f, epsilon), ENDPOINTS)
+    return Source(rbf(T, length_scale, sigma_f, epsilon), ENDPOINTS, modes=modes)
 
 
 def fit_rbf(x: Tensor, index: Sequence[int] = (), epsilon: float = 1e-6) -> tuple[float, float]:

@@ -79,9 +79,6 @@ class Constraint(nn.Module, ABC):
         """M(x), boolean (batch,): some waypoint is in collision, or is not a number."""
         return ~(self.clearance(x).amin(dim=1) >= 0)
 
-    def __add__(self, other: "Constraint") -> "Sum":
-        return Sum([self, other])
-
 
 class Sum(Constraint):
     """Several constraints at once: barriers add up, the clearance is the smallest."""
