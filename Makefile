@@ -53,7 +53,7 @@ sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: 
 figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,...
 	@$(CONFLOW) figures run=$(RUN)
 
-explain: .venv/installed  ## Draw why the covariant correction works, and finished runs beside it: PRESET=
+explain: .venv/installed  ## Draw why the covariant correction works, and what fewer collisions cost: PRESET=
 	@$(CONFLOW) explain preset=$(PRESET)
 
 demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": OUT= NUM= SEED=

@@ -122,20 +122,18 @@ def figures(arguments: list[str]) -> None:
 
 
 def explain(arguments: list[str]) -> None:
-    """Draw why the covariant correction works, and how the finished runs of a preset compare: preset=quick."""
+    """Draw why the covariant correction works, and what fewer collisions cost the published runs: preset=quick."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
     options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
     settings = config.load([f"preset={options['preset']}"])
 
-    from conflow.experiment import tracking
     from conflow.experiment.figures import explain, gallery
 
-    tracking.client()  # what is wrong with the store is said before anything is drawn
     console = _console()
+    gallery.draw_front(console)
     explain.draw(settings, console)
-    gallery.draw_front(settings, console)
 
 
 def demonstrations(arguments: list[str]) -> None:

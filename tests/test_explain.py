@@ -8,7 +8,6 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
-from mlflow.entities import Metric, Param, Run, RunData, RunInfo, RunTag
 from rich.console import Console
 
 from conflow.experiment import config
@@ -18,6 +17,7 @@ from conflow.experiment.config import Config
 from conflow.experiment.figures import explain
 from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations
 from conflow.experiment.figures.front import front
+from conflow.experiment.record import Record
 from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter
 from conflow.scene.constraint import Barrier
@@ -272,26 +272,22 @@ def test_explain_takes_a_preset_alone(conflow: Command) -> None:
         assert answer.stderr.count("\n") == 1
 
 
-def run(ablation: str, lambda_c: float, count: int, distance: float | None, at: str = "point") -> Run:
-    metrics = {"robot_collision_count": count, "num": 1000.0} | (
-        {} if distance is None else {"energy_distance": distance}
-    )
-    return Run(
-        RunInfo("id", "0", "user", "FINISHED", 0, 1, "active"),
-        RunData(
-            [Metric(f"test/none/{key}", value, 0, 0) for key, value in metrics.items()],
-            [Param("correction.lambda_c", str(lambda_c)), Param("correction.at", at)],
-            [RunTag("ablation", ablation)],
-        ),
-    )
+def record(ablation: str, preset: str, seed: int, count: int, distance: float | None) -> Record:
+    metrics = {"test/none/robot_collision_count": count, "test/none/num": 1000.0}
+    metrics |= {} if distance is None else {"test/none/energy_distance": distance}
+    return Record("id", ablation, preset, seed, {}, metrics, {}, 60.0)
 
 
-def test_the_front_shows_every_run_once_and_a_curve_where_the_weight_varies() -> None:
-    """Rates are counts over numbers; runs without an energy distance are left out."""
-    runs = [run("plus", 24, 0, 0.004, "end"), run("plus", 3, 7, 0.001, "end"), run("cgp", 2.5, 300, 0.03)]
-    weights, distances = front([*runs, run("fm", 0, 270, None)]).axes
-    assert points(weights) == {"plus": [[3, 0.007], [24, 0.0]]}
-    assert points(distances) == {"cgp": [[0.03, 0.3]], "plus": [[0.001, 0.007], [0.004, 0.0]]}
+def test_the_front_has_a_point_for_each_ablation_and_preset() -> None:
+    """Rates are pooled over seeds, distances averaged; runs without a distance are left out."""
+    runs = [record("cgp", "quick", seed, 300 + seed, 0.03 + 0.01 * seed) for seed in range(3)]
+    runs += [record("cgp", "long", 0, 16, 0.0), record("fm", "quick", 0, 270, None)]
+    (axis,) = front(runs).axes
+    assert points(axis) == {
+        "cgp, quick": [pytest.approx([0.04, 0.301])],
+        "cgp, long": [pytest.approx([0.0, 0.016])],
+    }
+    assert {text.get_text() for text in axis.texts} == {"cgp"}
 
 
 def points(axis: Axes) -> dict[object, list[list[float]]]:

@@ -1,66 +1,71 @@
-"""What fewer collisions cost: the rate of finished runs against lambda, and against the distance to D+."""
+"""What fewer collisions cost: the unguided rate against the distance to D+, of the records of published runs."""
 
-from collections.abc import Mapping, Sequence
+import statistics
+from collections.abc import Sequence
 from typing import Any
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from mlflow.entities import Run
+from matplotlib.lines import Line2D
 
 from conflow.experiment.metrics import wilson
+from conflow.experiment.record import Record
 
 METRIC = "test/none/"
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255")
 MARKERS = "osD^vP*X<>pdh8"
 
 
-def front(runs: Sequence[Run]) -> Figure:
-    """Unguided robot collisions of runs on the same demonstrations, with 95 % intervals.
+def front(records: Sequence[Record]) -> Figure:
+    """Unguided robot collisions, with 95 % intervals, against the energy distance to held-out D+.
 
-    Left: against the weight lambda of the correction, one curve for each method of which several weights were
-    trained. Right: against the energy distance to held-out D+, for every method: the nearer to the corner the better.
+    A point for each ablation and preset, over its seeds, and a line from one preset of an ablation to the other: the
+    nearer to the lower left the better.
     """
-    figure = Figure(figsize=(10.8, 4.6), layout="constrained")
-    weights, distances = figure.subplots(1, 2)
-    series = _series([run for run in runs if f"{METRIC}energy_distance" in run.data.metrics])
-    for i, (name, members) in enumerate(series.items()):
-        look = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "ms": 5, "label": name}
-        several = len({_weight(run) for run in members}) > 1
-        if several:
-            _errorbar(weights, members, [_weight(run) for run in members], {**look, "ls": "-"})
-        _errorbar(distances, members, [run.data.metrics[f"{METRIC}energy_distance"] for run in members], look)
-    weights.set_xscale("symlog", linthresh=1)
-    weights.set(xlabel=r"weight $\lambda_c$ of the correction", title="collisions against the weight")
-    distances.set_xscale("symlog", linthresh=0.01)
-    distances.axvline(0, color="#666666", lw=0.8)
-    distances.set(xlabel="energy distance to held-out $D^+$ (workspace units)", title="what they cost")
-    for axis in (weights, distances):
-        axis.set_yscale("symlog", linthresh=1e-3)
-        axis.set(ylabel="robot-collision rate, no guidance", ylim=(-1e-4, 1))
-        axis.spines[["top", "right"]].set_visible(False)
-    figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    presets = sorted({one.preset for one in records})
+    figure = Figure(figsize=(10.8, 6.2), layout="constrained")
+    axis = figure.subplots()
+    for i, (ablation, points) in enumerate(_points(records).items()):
+        colour = COLOURS[i % len(COLOURS)]
+        axis.plot(*zip(*((x, rate) for x, rate, _, _ in points.values()), strict=True), color=colour, lw=0.8, alpha=0.5)
+        for preset, (x, rate, low, high) in points.items():
+            spread = ([rate - low], [high - rate])
+            look: dict[str, Any] = {
+                "color": colour,
+                "marker": MARKERS[presets.index(preset)],
+                "label": f"{ablation}, {preset}",
+            }
+            axis.errorbar([x], [rate], yerr=spread, ms=6, capsize=2, lw=1, **look)
+            # Neighbours in the alphabet are often neighbours here.
+            place = (6, 3 if i % 2 else -10)
+            axis.annotate(ablation, (x, rate), place, textcoords="offset points", fontsize=8, color=colour)
+    axis.set_xscale("symlog", linthresh=0.01)
+    axis.set_yscale("symlog", linthresh=1e-3)
+    axis.axvline(0, color="#666666", lw=0.8)
+    axis.set(
+        xlabel="energy distance to held-out $D^+$ (workspace units)",
+        ylabel="robot-collision rate, no guidance",
+        ylim=(-1e-4, 1),
+        title="what fewer collisions cost",
+    )
+    axis.spines[["top", "right"]].set_visible(False)
+    legend = [
+        Line2D([], [], color="#666666", marker=marker, ls="", label=f"preset {preset}")
+        for marker, preset in zip(MARKERS, presets, strict=False)
+    ]
+    figure.legend(handles=legend, loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
-def _series(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs of one method, that is of one config but for seed and weight, in order of the weight."""
-    series: dict[str, list[Run]] = {}
-    for run in sorted(runs, key=_weight):
-        at = " at x_t" if run.data.params["correction.at"] == "point" and run.data.tags["ablation"] == "plus" else ""
-        series.setdefault(run.data.tags["ablation"] + at, []).append(run)
-    return dict(sorted(series.items()))
-
-
-def _weight(run: Run) -> float:
-    return float(run.data.params["correction.lambda_c"])
-
-
-def _errorbar(axis: Axes, runs: Sequence[Run], x: Sequence[float], look: Mapping[str, Any]) -> None:
-    rates, below, above = [], [], []
-    for run in runs:
-        count, total = (int(run.data.metrics[f"{METRIC}{key}"]) for key in ("robot_collision_count", "num"))
-        low, high = wilson(count, total)
-        rates.append(count / total)
-        below.append(count / total - low)
-        above.append(high - count / total)
-    axis.errorbar(x, rates, yerr=(below, above), **{"ls": "", "lw": 1, "capsize": 2, **look})
+def _points(records: Sequence[Record]) -> dict[str, dict[str, tuple[float, float, float, float]]]:
+    """By ablation and preset, over the seeds: mean energy distance, pooled rate, and Wilson's interval of it."""
+    groups: dict[str, dict[str, list[dict[str, float]]]] = {}
+    for one in records:
+        if f"{METRIC}energy_distance" in one.metrics:
+            groups.setdefault(one.ablation, {}).setdefault(one.preset, []).append(one.metrics)
+    found: dict[str, dict[str, tuple[float, float, float, float]]] = {}
+    for ablation, by_preset in sorted(groups.items()):
+        for preset, runs in sorted(by_preset.items()):
+            count, total = (sum(int(run[METRIC + key]) for run in runs) for key in ("robot_collision_count", "num"))
+            distance = statistics.mean(run[f"{METRIC}energy_distance"] for run in runs)
+            found.setdefault(ablation, {})[preset] = (distance, count / total, *wilson(count, total))
+    return found

@@ -8,9 +8,8 @@ from matplotlib.figure import Figure
 from mlflow.entities import Run
 from rich.console import Console
 
-from conflow.experiment import diagnostics, tracking
+from conflow.experiment import diagnostics, record, tracking
 from conflow.experiment.build import random_stream
-from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import Evaluation, cycle
 from conflow.experiment.figures import curves, workspace
@@ -35,14 +34,13 @@ def draw(wanted: Sequence[str], console: Console) -> None:
         workspace.save({"methods": workspace.methods(made)}, _folder())
 
 
-def draw_front(settings: Config, console: Console) -> None:
-    """Draw what fewer collisions cost, over all finished runs of a preset on its demonstrations."""
-    runs = tracking.runs("FINISHED", preset=settings.preset, data_digest=DemonstrationData(settings).digest)
-    if not runs:
-        console.print(f"front.png is left out, no run of preset {settings.preset} has finished", highlight=False)
-        return
-    workspace.save({"front": front(runs)}, _folder() / "explain")
-    console.print(f"front.png: unguided collisions of {len(runs)} finished runs, and what they cost", highlight=False)
+def draw_front(console: Console) -> None:
+    """Draw what fewer collisions cost, of the published runs as they are at their presets."""
+    records = [one for one in record.from_files() if not one.changes()]
+    workspace.save({"front": front(records)}, _folder() / "explain")
+    console.print(
+        f"front.png: unguided collisions of {len(records)} published runs, and what they cost", highlight=False
+    )
 
 
 def _folder() -> Path:
