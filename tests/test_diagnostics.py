@@ -1,15 +1,17 @@
 """Guidance and solvers measured on fields simple enough to follow by hand."""
 
 import math
+from typing import cast
 
 import pytest
 import torch
 
 from conflow.experiment import config
 from conflow.experiment.build import random_stream
-from conflow.experiment.diagnostics import by_evaluations, collisions_by_weight, guidance
+from conflow.experiment.diagnostics import by_evaluations, collisions_by_weight, guidance, taken_back
 from conflow.experiment.metrics import smoothness
 from conflow.experiment.module import SETTINGS, ConFlow, Setting
+from conflow.flow.network import ResMLP
 from conflow.flow.sampler import Solver, integrate
 from conflow.scene.trajectories import swap
 
@@ -48,6 +50,29 @@ def test_without_guidance_a_constant_field_only_moves_the_trajectories(gamma: in
     for t, value in zip(found.t.tolist(), found.obstacle_barrier.tolist(), strict=True):
         gap = min(math.dist((x + 0.4 * t, 0.4 * t), (0, 0.5)) for x in (-0.1, 0.1)) - 0.25
         assert value == pytest.approx(32 * -math.log1p(math.exp(-gamma * gap)) / gamma, rel=1e-4)
+
+
+class Back(torch.nn.Module):
+    """v = -share x / (1 - t), under which a share of any displacement is gone by t = 1, to first order."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, x: torch.Tensor, t: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+        return -self.share * x / (1 - t)[:, None, None]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("arguments", [(), ("ablation=plus", "source.fit=false")])
+def test_what_a_velocity_takes_back_is_its_share_along_every_mode(share: float, arguments: tuple[str, ...]) -> None:
+    flow = model(*arguments)
+    flow.v = cast(ResMLP, Back(share))
+    x_1 = swap(100)
+    found = taken_back(flow, flow.source.sample(flow.source.observe(x_1), random_stream("test")), x_1, 0.6)
+    assert found.shape == (flow.source.modes.shape[1],)
+    # Differences of velocities, in float32.
+    torch.testing.assert_close(found, torch.full_like(found, share), atol=1e-3, rtol=0)
 
 
 def test_the_ratio_is_the_guidance_over_the_velocity() -> None:

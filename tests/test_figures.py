@@ -275,6 +275,7 @@ def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
     written = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert written.pop("mine.txt") == b"kept"
     pictures = {"demonstrations", "sources", "page", "flow", "distances", "guidance", "solver_steps", "guidance_weight"}
+    pictures.add("taken_back")
     assert written.keys() == {f"{name}.png" for name in pictures} | {"animation.html"}
     assert all(written[f"{name}.png"].startswith(b"\x89PNG") for name in pictures)
     logged = {file.name: file.read_bytes() for file in tracking.artifact(finished, "figures").iterdir()}
@@ -290,9 +291,9 @@ def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: saved.append(path))
     monkeypatch.setattr(gallery, "_log", lambda *_: None)
     tracking.client().update_run(finished.info.run_id, name="../../elsewhere")
-    gallery.draw([finished.info.run_id, finished.info.run_id], Console(quiet=True))
+    gallery.draw([finished.info.run_id, "latest"], Console(quiet=True))
     assert {path.parent for path in saved} == {Path("runs/figures/_elsewhere"), Path("runs/figures")}
-    assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png"]
+    assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png", "taken_back.png"]
 
 
 def test_a_second_call_draws_the_same_samples(data: DemonstrationData, evaluation: Evaluation) -> None:

@@ -18,6 +18,8 @@ LABELS: dict[Setting, str] = {"none": "no guidance", "robot": "around robots", "
 SOLVERS: dict[Solver, str] = {"euler": "#0072B2", "midpoint": "#D55E00"}
 FACTORS = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
 BUDGETS = (2, 4, 8, 16, 32, 64, 128, 256)
+MODES = 10
+"""Of the source, the widest; all that demonstrations and correction have to tell is in them."""
 MARK = "#666666"
 
 
@@ -65,6 +67,25 @@ def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Fig
     return figure
 
 
+def taken_back(shares: Mapping[str, Tensor]) -> Figure:
+    """How much of a push along grad C the velocity takes back in each mode of the source, a line for each name."""
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axis = figure.subplots()
+    for name, share in shares.items():
+        axis.plot(range(1, 1 + len(share[:MODES])), share[:MODES], marker="o", ms=4, label=name)
+    for value in (0, 1):
+        axis.axhline(value, color=MARK, lw=0.8, ls=":")
+    axis.set(
+        xlabel=r"eigenvector of $\Sigma$, the widest first",
+        ylabel=r"share of a push along $\nabla C$",
+        title="what the velocity takes back by t = 1",
+        xticks=range(1, 1 + MODES),
+    )
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(frameon=False)
+    return figure
+
+
 def guidance(settings: Mapping[Setting, Guidance]) -> Figure:
     """How strong guidance is along t, what it does to the barriers, and how far it moves start and goal."""
     figure = Figure(figsize=(9, 7), layout="constrained")
@@ -76,7 +97,7 @@ def guidance(settings: Mapping[Setting, Guidance]) -> Figure:
         robots.plot(found.t, found.robot_barrier, **look)
         obstacle.plot(found.t, found.obstacle_barrier, **look)
     _drift(drift, settings)
-    ratio.set(title="guidance against flow", ylabel=r"$|\lambda u^c(x_t)|\ /\ |v(x_t, t)|$")
+    ratio.set(title="guidance against flow", ylabel="|guidance| / $|v(x_t, t)|$")
     ratio.set_ylim(bottom=0)
     robots.set(title="barrier of the robots", ylabel="mean $C(x_t)$ (workspace units)")
     obstacle.set(title="barrier of the obstacle", ylabel="mean $C(x_t)$ (workspace units)")

@@ -7,6 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from mlflow.entities import Run
 from rich.console import Console
+from torch import Tensor
 
 from conflow.experiment import diagnostics, record, tracking
 from conflow.experiment.build import random_stream
@@ -19,6 +20,8 @@ from conflow.experiment.finished import MODEL_FILE, demonstrations, load_model
 from conflow.experiment.module import SETTINGS, ConFlow, start_and_goal
 
 NUM = 512
+TIMES = (0.6, 0.3, 0.9)
+"""At which `taken_back` is drawn; of several runs at the first."""
 
 
 def draw(wanted: Sequence[str], console: Console) -> None:
@@ -28,10 +31,13 @@ def draw(wanted: Sequence[str], console: Console) -> None:
         ConfigError: there is no such run.
     """
     runs = [tracking.find_run(name) for name in wanted]
-    made = [(str(run.info.run_name), *_draw_run(run, console)) for run in runs]
-    if len(runs) > 1:
-        console.print("all runs: methods.png", highlight=False)
-        workspace.save({"methods": workspace.methods(made)}, _folder())
+    made = {name: _draw_run(run, console) for name, run in zip(wanted, runs, strict=True)}
+    if len(made) > 1:
+        console.print("all runs: methods.png, taken_back.png", highlight=False)
+        methods = workspace.methods([(name, model, evaluation) for name, (model, evaluation, _) in made.items()])
+        taken_back = curves.taken_back({name: shares for name, (_, _, shares) in made.items()})
+        taken_back.axes[0].set_title(f"what the velocity takes back by t = 1, at t = {TIMES[0]}")
+        workspace.save({"methods": methods, "taken_back": taken_back}, _folder())
 
 
 def draw_front(console: Console) -> None:
@@ -47,8 +53,8 @@ def _folder() -> Path:
     return tracking.RUNS / "figures"
 
 
-def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation]:
-    """Write and log a run's pictures; its model and the samples that they show."""
+def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
+    """Write and log a run's pictures; its model, the samples that they show, and `taken_back` at the first time."""
     model = load_model(tracking.artifact(run, MODEL_FILE))
     data = demonstrations(run, model.config)
     name = str(run.info.run_name)
@@ -56,13 +62,16 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation]:
     folder = _folder() / re.sub(r"[^\w-]+", "_", name)
     console.print(f"{name}: {NUM} trajectories under each setting", highlight=False)
     evaluation = sample(model, data)
-    x_0, ends = evaluation.source_samples, start_and_goal(cycle(data.test.x, NUM))
+    x_0, x_1 = evaluation.source_samples, cycle(data.test.x, NUM)
+    ends = start_and_goal(x_1)
+    shares = {t: diagnostics.taken_back(model, x_0, x_1, t) for t in TIMES}
     pictures: dict[str, Callable[[], Figure]] = {
         "demonstrations": lambda: workspace.demonstrations(data),
         "sources": lambda: workspace.sources(model, evaluation),
         "page": lambda: workspace.page(model, data, evaluation),
         "flow": lambda: workspace.flow(model, x_0, ends),
         "distances": lambda: workspace.distances(model, evaluation),
+        "taken_back": lambda: curves.taken_back({f"t = {t}": share for t, share in shares.items()}),
         "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in SETTINGS}),
         "solver_steps": lambda: curves.solver_steps(model, x_0, ends),
         "guidance_weight": lambda: curves.guidance_weight(model, x_0, ends),
@@ -76,7 +85,7 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation]:
     # Training logged its own of these, of all its samples.
     _log(run, [page, *(folder / f"{title}.png" for title in pictures if title not in workspace.OF_TRAINING)])
     console.print(f"{name}: pictures are in {folder}", highlight=False)
-    return model, evaluation
+    return model, evaluation, shares[TIMES[0]]
 
 
 def sample(model: ConFlow, data: DemonstrationData) -> Evaluation:
