@@ -87,7 +87,7 @@ lock:  ## Resolve pyproject.toml anew into requirements.lock
 .venv/installed: requirements.lock pyproject.toml
 	@exec 9>.venv.lock; ! command -v flock >/dev/null || flock 9; \
 	if [ $@ -nt requirements.lock ] && [ $@ -nt pyproject.toml ]; then exit 0; fi; \
-	echo "Installing the locked environment into .venv (a few minutes, once)"; \
+	echo "Installing the locked environment into .venv (a few minutes, once)" >&2; \
 	python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "conflow: python3 is $$(python3 --version), expected 3.11 or newer" >&2; exit 2; }; \
 	{ test -x $(PYTHON) || python3 -m venv .venv; } \
 	&& $(PYTHON) -m pip install -qq --disable-pip-version-check -r requirements.lock \

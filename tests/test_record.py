@@ -9,6 +9,7 @@ from scipy import stats
 
 from conflow.experiment import compare, record, report, tracking
 from conflow.experiment.config import ConfigError, flatten, load
+from conflow.experiment.metrics import wilson
 from conflow.experiment.record import Record
 
 
@@ -118,8 +119,8 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     published("cgp", 0, 16, preset="long")
     published("fm", 0, 31)
     published("cgp", 0, 280, "train.batch_size=512", preset="paper")
-    paper, long, quick = compare.collect_reference()
-    assert (paper.preset, long.preset, quick.preset) == ("paper", "long", "quick")
+    long, quick, paper = compare.collect_reference()
+    assert (long.preset, quick.preset, paper.preset) == ("long", "quick", "paper")
     change = "ConFlow (D+ and D-), train.batch_size=512"
     assert [cell(found, "4", change, "none: robot").count for found in (paper, quick)] == [280, 290]
     assert [cell(found, "1", "ConFlow (D+ and D-)", "none: robot").count for found in (long, quick)] == [16, 300]
@@ -129,10 +130,17 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     assert "PRESET=paper ARGS='train.batch_size=512'" in paper.commands[change]
     console = Console(width=400)
     with console.capture() as captured:
-        report.render([paper, long, quick], "markdown", console)
-    titles = [line.strip("*") for line in captured.get().splitlines() if line.startswith("**Table")]
+        report.render([long, quick, paper], "markdown", console)
+    text = captured.get()
+    low, high = wilson(300, 1000)
+    overview = text[text.index("**Robot collisions without guidance, at each preset**") :].splitlines()
+    assert overview[2] == "|  | paper | long | quick |"
+    assert overview[4].startswith("| ConFlow (D+ and D-) | 0.016 | 0.0160 [")
+    assert overview[4].endswith(f"16 of 1000, 1 seed | 0.3000 [{low:.4f}, {high:.4f}]<br>300 of 1000, 1 seed |")
+    assert overview[5].startswith("| FM (D+) | 0.031 |  | 0.0310 [")
+    titles = [line.strip("*") for line in text.splitlines() if line.startswith("**Table")]
     assert [title[6] + title.rsplit(" ", 1)[1] for title in titles] == [
-        *("4paper", "1long", "2long", "3long", "4long", "1quick", "2quick", "3quick", "4quick")
+        *("1long", "2long", "3long", "4long", "1quick", "2quick", "3quick", "4quick", "4paper")
     ]
 
 

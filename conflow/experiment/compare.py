@@ -195,6 +195,8 @@ def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
 def collect_reference() -> list[Comparison]:
     """Compare the records under runs/reference/, preset by preset from the one of the most training down.
 
+    A preset that has changed runs alone, with nothing to compare them with, comes last.
+
     Raises:
         ConfigError: there are none.
     """
@@ -204,7 +206,7 @@ def collect_reference() -> list[Comparison]:
         plain = [one for one in records if one.preset == preset and not one.changes()]
         changed = [one for one in records if one.preset == preset and one.changes()]
         found.append(_comparison(preset, _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)))
-    return found
+    return sorted(found, key=lambda one: not one.claims)
 
 
 def _scale(preset: str) -> int:

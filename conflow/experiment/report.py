@@ -10,13 +10,15 @@ from typing import Any, Literal, cast, get_args
 from rich.console import Console
 from rich.table import Table
 
-from conflow.experiment.compare import COLLISIONS, GUARDS, QUALITIES, READINGS, SMOOTHNESS, Cell, Comparison
+from conflow.experiment.compare import COLLISIONS, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell, Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.evaluation import Metrics
 from conflow.experiment.module import Setting
 
 AGAIN = "again with"
 Format = Literal["table", "markdown", "csv", "json"]
+Sheet = tuple[str, list[str], list[list[str]]]
+"""Title, header and rows of a table, as text."""
 
 ROWS = {
     "robot_collision_rate": "robot-collision rate",
@@ -75,12 +77,18 @@ def render(comparisons: Sequence[Comparison], form: Format, console: Console) ->
         console.out(csv_text(Cell, cells), end="", highlight=False)
     else:
         for one in comparisons:
-            for title, header, rows in _sheets(one):
-                if form == "markdown":
-                    console.out(markdown(title, header, rows), highlight=False)
-                else:
-                    console.print(table(title, header, rows))
+            _print_sheets(_sheets(one), form, console)
             console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
+        if len(comparisons) > 1:
+            _print_sheets([_overview(comparisons)], form, console)
+
+
+def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> None:
+    for title, header, rows in sheets:
+        if form == "markdown":
+            console.out(markdown(title, header, rows), highlight=False)
+        else:
+            console.print(table(title, header, rows))
 
 
 def csv_text(kind: Any, rows: Iterable[Any]) -> str:
@@ -92,7 +100,34 @@ def csv_text(kind: Any, rows: Iterable[Any]) -> str:
     return text.getvalue()
 
 
-def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]]]]:
+def _overview(comparisons: Sequence[Comparison]) -> Sheet:
+    """The first column of Table 1 at every preset that has one."""
+    none = next(iter(COLLISIONS.values()))
+    cells = {
+        (cell.row, one.preset): cell
+        for one in comparisons
+        for cell in one.cells
+        if (cell.table, cell.column) == ("1", none) and cell.row in METHODS.values()
+    }
+    presets = list(dict.fromkeys(preset for _, preset in cells))
+    rows = []
+    for method in METHODS.values():
+        of_row = [cells.get((method, preset)) for preset in presets]
+        if any(of_row):
+            paper = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")
+            rows.append([method, paper, *(_rate(cell) if cell else "" for cell in of_row)])
+    return "Robot collisions without guidance, at each preset", ["", "paper", *presets], rows
+
+
+def _rate(cell: Cell) -> str:
+    return f"{cell.value:.4f} [{cell.low:.4f}, {cell.high:.4f}]\n{cell.count} of {cell.trajectories}, {_seeds(cell)}"
+
+
+def _seeds(cell: Cell) -> str:
+    return f"{cell.seeds} seed{'s' if cell.seeds > 1 else ''}"
+
+
+def _sheets(comparison: Comparison) -> list[Sheet]:
     """Title, header and rows of the tables and of the claims, as text."""
     tables = {
         "1": ("Table 1: collision rates (setting: what is hit)", COLLISIONS),
@@ -108,9 +143,7 @@ def _sheets(comparison: Comparison) -> list[tuple[str, list[str], list[list[str]
         for row in _ordered((row for row, _ in cells), metrics.values()):
             of_row = [cells.get((row, column)) for column in columns]
             known = next(cell for cell in of_row if cell is not None)
-            size = (
-                f"{known.preset}, {known.seeds} seed{'s' if known.seeds > 1 else ''}, {known.trajectories} trajectories"
-            )
+            size = f"{known.preset}, {_seeds(known)}, {known.trajectories} trajectories"
             again = comparison.commands.get(row, "")
             rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row), again])
         if number == "2":  # whose columns are the methods
