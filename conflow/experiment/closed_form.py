@@ -37,7 +37,7 @@ def minimiser(source: Source, x_1: Tensor, M: Tensor, correction: Callable[[Tens
     """The field that minimises L_CG over demonstrations x_1 (N, T, D) with violations M (N,), exactly.
 
     v(x, t) = E[x_1 - x_0 | x_t] + lambda_c E[M | x_t] u^c(x_t), the conditional mean of the loss's target. What is
-    subtracted off, x_t - E[x_1 | x_t] over 1 - t, leads back everything that no demonstration has. In float64: in the
+    subtracted off, x_t - E[x_1 | x_t] over 1 - t, brings back everything that no demonstration has. In float64: in the
     source's trailing modes float32's rounding would be larger than what is to be seen.
     """
     z_1, known = whitened(source, x_1), torch.cat([x_1.flatten(1), M[:, None]], dim=1).double()

@@ -94,14 +94,15 @@ PAPER_2 = {
 UNGUIDED = {
     "cgp": "too short a training: the filter pushes x_t to where the source has no mass (make explain: support), and "
     "the network learns only late to bring it back; preset long is long enough",
+    "no_negatives": "lower than the paper's: a narrower network at a one-cycle rate may fit D+ more closely",
     "fm": "from a standard normal the ends and the smoothness have to be learned (start error of the Gaussian source "
     "in Table 2), and feasibility with them",
     "fm_mixed": "a model of demonstrations of which 30 % collide cannot give the paper's 0.055 unguided: its cells for "
     "no and for robot guidance look exchanged",
 }
 GUIDED = (
-    "guidance at the paper's weights does little: what it pushes in mid-flow the flow pulls back, and half of the "
-    "demonstrations pass through the obstacle (make figures: guidance, guidance_weight)"
+    "guided: the paper does not say where its obstacle stands, and through this one half of the demonstrations pass; "
+    "what the paper's weights push in mid-flow the flow partly pulls back (make figures: guidance, guidance_weight)"
 )
 OPEN = (
     *("constraint.reduction", "correction.smoothing", "correction.edges", "correction.keep_ends", "correction.mask"),

@@ -60,7 +60,7 @@ class SpectralMLP(nn.Module):
 
     h_theta sees z / sigma_t, the conditioned values x_O, Fourier features of t, clearances, and grad C in the modes.
     Of z / sigma_t it sees no more than +-SEEN: where a correction has pushed x out of all that training shows, in a
-    mode that is narrow, h_theta is not asked for what it never learned, and a z alone leads back.
+    mode that is narrow, h_theta is not asked for what it never learned, and a z alone brings it back.
 
     Args:
         source: its modes, usually a few leading ones.

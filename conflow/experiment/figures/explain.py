@@ -197,7 +197,7 @@ def exact(settings: Config) -> Figure:
         own = {weight: count for (of, weight), count in counts.items() if of == name}
         rate(rates, list(own), list(own.values()), SAMPLES, colour, name)
     rates.axhline(float(M.float().mean()), color=COLLISION, ls="--", lw=1, label="demonstrations")
-    rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's network")
+    rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's reported rate")
     rates.set(xlabel=r"weight $\lambda_c$", ylabel="robot-collision rate")
     rates.set_ylim(top=1.6 * rates.get_ylim()[1])  # room for the legend
     rates.set_title(f"{SAMPLES} samples of the exact flow\nband: 95 % Wilson")
@@ -207,7 +207,7 @@ def exact(settings: Config) -> Figure:
         _finish(axis, fontsize="small")
     figure.suptitle(
         f"The exact minimiser of the paper's loss collides in {counts[PAPERS, lambda_c]} of {SAMPLES} samples at λ = "
-        f"{lambda_c:g}:\nit leads back what the filter pushes astray, which a network has to learn"
+        f"{lambda_c:g}:\nit brings back what the filter pushes astray, which a network has to learn"
     )
     return figure
 

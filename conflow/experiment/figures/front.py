@@ -35,9 +35,10 @@ def front(records: Sequence[Record]) -> Figure:
                 "label": f"{ablation}, {preset}",
             }
             axis.errorbar([x], [rate], yerr=spread, ms=6, capsize=2, lw=1, **look)
-            # Neighbours in the alphabet are often neighbours here.
-            place = (6, 3 if i % 2 else -10)
-            axis.annotate(ablation, (x, rate), place, textcoords="offset points", fontsize=8, color=colour)
+        # Where it collides least; neighbours in the alphabet are often neighbours here.
+        x, rate, _, _ = min(points.values(), key=lambda point: point[1])
+        place = (6, 3 if i % 2 else -10)
+        axis.annotate(ablation, (x, rate), place, textcoords="offset points", fontsize=8, color=colour)
     axis.set_xscale("symlog", linthresh=0.01)
     axis.set_yscale("symlog", linthresh=1e-3)
     axis.axvline(0, color="#666666", lw=0.8)

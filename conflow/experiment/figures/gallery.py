@@ -20,8 +20,10 @@ from conflow.experiment.finished import MODEL_FILE, demonstrations, load_model
 from conflow.experiment.module import SETTINGS, ConFlow, start_and_goal
 
 NUM = 512
-TIMES = (0.6, 0.3, 0.9)
-"""At which `taken_back` is drawn; of several runs at the first."""
+TIMES = (0.3, 0.6, 0.9)
+"""At which `taken_back` is drawn."""
+COMPARED = 0.6
+"""The one of them at which several runs are compared."""
 
 
 def draw(wanted: Sequence[str], console: Console) -> None:
@@ -36,7 +38,7 @@ def draw(wanted: Sequence[str], console: Console) -> None:
         console.print("all runs: methods.png, taken_back.png", highlight=False)
         methods = workspace.methods([(name, model, evaluation) for name, (model, evaluation, _) in made.items()])
         taken_back = curves.taken_back({name: shares for name, (_, _, shares) in made.items()})
-        taken_back.axes[0].set_title(f"what the velocity takes back by t = 1, at t = {TIMES[0]}")
+        taken_back.axes[0].set_title(f"what the velocity takes back by t = 1, at t = {COMPARED}")
         workspace.save({"methods": methods, "taken_back": taken_back}, _folder())
 
 
@@ -54,7 +56,7 @@ def _folder() -> Path:
 
 
 def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
-    """Write and log a run's pictures; its model, the samples that they show, and `taken_back` at the first time."""
+    """Write and log a run's pictures; its model, the samples that they show, and `taken_back` at t = 0.6."""
     model = load_model(tracking.artifact(run, MODEL_FILE))
     data = demonstrations(run, model.config)
     name = str(run.info.run_name)
@@ -85,7 +87,7 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
     # Training logged its own of these, of all its samples.
     _log(run, [page, *(folder / f"{title}.png" for title in pictures if title not in workspace.OF_TRAINING)])
     console.print(f"{name}: pictures are in {folder}", highlight=False)
-    return model, evaluation, shares[TIMES[0]]
+    return model, evaluation, shares[COMPARED]
 
 
 def sample(model: ConFlow, data: DemonstrationData) -> Evaluation:
