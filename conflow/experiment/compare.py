@@ -101,8 +101,9 @@ UNGUIDED = {
     "no and for robot guidance look exchanged",
 }
 GUIDED = (
-    "guided: the paper does not say where its obstacle stands, and through this one half of the demonstrations pass; "
-    "what the paper's weights push in mid-flow the flow partly pulls back (make figures: guidance, guidance_weight)"
+    "guided: the paper does not say where its obstacle stands, and through this one half of the demonstrations pass; a "
+    "larger weight does more (make figures: guidance_weight), and after few steps of training the flow pulls back what "
+    "is pushed (guidance)"
 )
 OPEN = (
     *("constraint.reduction", "correction.smoothing", "correction.edges", "correction.keep_ends", "correction.mask"),

@@ -138,7 +138,7 @@ def _drift(axis: Axes, settings: Mapping[Setting, Guidance]) -> None:
         axis.bar_label(bars, fmt="%.2g")
     axis.set_xticks([0, 1], ["start", "goal"])
     axis.set(title="drift against the unguided sample", ylabel="mean distance (workspace units)")
-    axis.margins(y=0.12)
+    axis.margins(y=0.35)  # room for the legend above the bars
     axis.legend(frameon=False, loc="upper left")
     axis.spines[["top", "right"]].set_visible(False)
 
