@@ -69,7 +69,7 @@ def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Fig
 
 def taken_back(shares: Mapping[str, Tensor]) -> Figure:
     """How much of a push along grad C the velocity takes back in each mode of the source, a line for each name."""
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(7.2, 5.4), layout="constrained")
     axis = figure.subplots()
     for name, share in shares.items():
         axis.plot(range(1, 1 + len(share[:MODES])), share[:MODES], marker="o", ms=4, label=name)
@@ -82,7 +82,7 @@ def taken_back(shares: Mapping[str, Tensor]) -> Figure:
         xticks=range(1, 1 + MODES),
     )
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False)
+    figure.legend(loc="outside lower center", frameon=False)
     return figure
 
 
