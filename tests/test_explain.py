@@ -14,7 +14,7 @@ from conflow.experiment import config
 from conflow.experiment.build import build_source, robot_avoidance
 from conflow.experiment.closed_form import expected, minimiser, posterior
 from conflow.experiment.config import Config
-from conflow.experiment.figures import explain
+from conflow.experiment.figures import explain, gallery
 from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations
 from conflow.experiment.figures.front import front
 from conflow.experiment.record import Record
@@ -288,6 +288,15 @@ def test_the_front_has_a_point_for_each_ablation_and_preset() -> None:
         "cgp, long": [pytest.approx([0.0, 0.016])],
     }
     assert {text.get_text() for text in axis.texts} == {"cgp"}
+
+
+def test_without_published_runs_the_front_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    console = Console(width=200)
+    with console.capture() as captured:
+        gallery.draw_front(console)
+    assert captured.get().startswith("front.png is left out; reference: expected records in runs/reference/runs")
+    assert not Path("runs/figures").exists()
 
 
 def points(axis: Axes) -> dict[object, list[list[float]]]:

@@ -1,6 +1,7 @@
 """What is published of a run, and the tables that are made of it alone."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -138,6 +139,11 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     assert overview[4].startswith("| ConFlow (D+ and D-) | 0.016 | 0.0160 [")
     assert overview[4].endswith(f"16 of 1000, 1 seed | 0.3000 [{low:.4f}, {high:.4f}]<br>300 of 1000, 1 seed |")
     assert overview[5].startswith("| FM (D+) | 0.031 |  | 0.0310 [")
+    with console.capture() as captured:
+        report.render([long, quick, paper], "json", console)
+    tree = json.loads(captured.get())
+    assert [each["preset"] for each in tree["cells"]] == [c.preset for one in (long, quick, paper) for c in one.cells]
+    assert tree["presets"]["quick"]["claims"][0]["verdict"] == "reversed"
     titles = [line.strip("*") for line in text.splitlines() if line.startswith("**Table")]
     assert [title[6] + title.rsplit(" ", 1)[1] for title in titles] == [
         *("1long", "2long", "3long", "4long", "1quick", "2quick", "3quick", "4quick", "4paper")
@@ -167,6 +173,21 @@ def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
         report.render([found], "markdown", console)
     assert "paper 0.043, not distinguishable" in captured.get()
     assert "paper 0.016, differs" in captured.get()
+
+
+def test_a_mean_over_seeds_has_the_interval_of_independent_errors() -> None:
+    """Of k seeds with errors e_i: sqrt(sum e_i^2) / k below and above, each side for itself."""
+    for seed, (low, high) in enumerate(((0.007, 0.014), (0.006, 0.013))):
+        made = published("cgp", seed, 300)
+        ends = {"test/none/smoothness_median_low": low, "test/none/smoothness_median_high": high}
+        replace(made, metrics=made.metrics | ends).write(record.FOLDER)
+    (found,) = compare.collect_reference()
+    one = cell(found, "3", "ConFlow (D+ and D-)", "smoothness, median")
+    assert (one.low, one.high) == pytest.approx((0.01 - 0.005 / 2, 0.01 + 0.005 / 2))
+    # Where a seed has none, neither has the mean.
+    published("cgp", 1, 300)
+    (found,) = compare.collect_reference()
+    assert cell(found, "3", "ConFlow (D+ and D-)", "smoothness, median").low is None
 
 
 def test_no_records_and_broken_ones_are_named() -> None:

@@ -1,6 +1,7 @@
 """The paper's tables and claims and tables of our own, filled from finished runs or from the records of them alone."""
 
 import itertools
+import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -117,7 +118,8 @@ class Cell:
     """One number of a table.
 
     Attributes:
-        value, low, high: of a rate the pooled one with Wilson's interval; else the mean over seeds, without one.
+        value, low, high: of a rate the pooled one with Wilson's interval; else the mean over seeds, with the one that
+            follows from theirs.
         seed_low, seed_high: the smallest and the largest of the seeds.
         count: trajectories that the rate counts, over all seeds, of a rate.
         trajectories: over all seeds.
@@ -360,8 +362,10 @@ def _cell(table: str, row: str, column: str, paper: float | None, metric: str, r
     if not runs or not _measured(metric, runs):
         return None
     values, trajectories = _values(metric, runs), sum(_trajectories(metric, run) for run in runs)
-    value, count, low, high, paper_p = statistics.mean(values), None, None, None, None
-    if f"{metric}_count" in runs[0].metrics:
+    value, count, paper_p = statistics.mean(values), None, None
+    if f"{metric}_count" not in runs[0].metrics:
+        low, high = _interval(value, metric, runs)
+    else:
         count = sum(int(run.metrics[f"{metric}_count"]) for run in runs)
         value = count / trajectories
         low, high = wilson(count, trajectories)
@@ -369,6 +373,16 @@ def _cell(table: str, row: str, column: str, paper: float | None, metric: str, r
             paper_p = _fisher_p(count, trajectories, round(paper * PAPER_TRAJECTORIES), PAPER_TRAJECTORIES)
     across = (min(values), max(values), len(runs), count, trajectories, runs[0].preset, paper_p)
     return Cell(table, row, column, paper, value, low, high, *across)
+
+
+def _interval(value: float, metric: str, runs: Sequence[Record]) -> tuple[float | None, float | None]:
+    """Of a mean over seeds: the distances to the ends of the seeds' own intervals, as independent errors of a mean."""
+    ends = [(run.metrics.get(f"{metric}_low"), run.metrics[metric], run.metrics.get(f"{metric}_high")) for run in runs]
+    known = [(middle - low, high - middle) for low, middle, high in ends if low is not None and high is not None]
+    if len(known) < len(runs):
+        return None, None
+    below, above = (math.hypot(*distances) / len(runs) for distances in zip(*known, strict=True))
+    return value - below, value + above
 
 
 def _values(metric: str, runs: Sequence[Record]) -> list[float]:

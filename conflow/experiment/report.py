@@ -69,9 +69,9 @@ def checked_format(name: str) -> Format:
 
 
 def render(comparisons: Sequence[Comparison], form: Format, console: Console) -> None:
-    """Print comparisons as tables, Markdown, CSV (the cells) or JSON (a list of everything)."""
+    """Print comparisons as tables, Markdown, CSV (the cells) or JSON (everything)."""
     if form == "json":
-        console.out(json.dumps([asdict(one) for one in comparisons], indent=1), highlight=False)
+        console.out(json.dumps(_tree(comparisons), indent=1), highlight=False)
     elif form == "csv":
         cells = [cell for one in comparisons for cell in one.cells]
         console.out(csv_text(Cell, cells), end="", highlight=False)
@@ -89,6 +89,16 @@ def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> No
             console.out(markdown(title, header, rows), highlight=False)
         else:
             console.print(table(title, header, rows))
+
+
+def _tree(comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """A comparison as it is; of several all cells together, which name their preset, and the rest by preset."""
+    trees = [asdict(one) for one in comparisons]
+    if len(trees) == 1:
+        return trees[0]
+    return {"cells": [cell for tree in trees for cell in tree.pop("cells")]} | {
+        "presets": {tree.pop("preset"): tree for tree in trees}
+    }
 
 
 def csv_text(kind: Any, rows: Iterable[Any]) -> str:
@@ -123,6 +133,10 @@ def _rate(cell: Cell) -> str:
     return f"{cell.value:.4f} [{cell.low:.4f}, {cell.high:.4f}]\n{cell.count} of {cell.trajectories}, {_seeds(cell)}"
 
 
+def _size(cell: Cell) -> str:
+    return f"{cell.preset}, {_seeds(cell)}, {cell.trajectories} trajectories"
+
+
 def _seeds(cell: Cell) -> str:
     return f"{cell.seeds} seed{'s' if cell.seeds > 1 else ''}"
 
@@ -142,14 +156,19 @@ def _sheets(comparison: Comparison) -> list[Sheet]:
         rows = []
         for row in _ordered((row for row, _ in cells), metrics.values()):
             of_row = [cells.get((row, column)) for column in columns]
-            known = next(cell for cell in of_row if cell is not None)
-            size = f"{known.preset}, {_seeds(known)}, {known.trajectories} trajectories"
-            again = comparison.commands.get(row, "")
-            rows.append([f"{row}\n{size}", *(_text(cell) if cell else "" for cell in of_row), again])
-        if number == "2":  # whose columns are the methods
-            rows = [row[:-1] for row in rows] + [[AGAIN, *(comparison.commands.get(column, "") for column in columns)]]
+            texts = [_text(cell) if cell else "" for cell in of_row]
+            if number == "2":  # whose columns are the methods
+                rows.append([row, *texts])
+            else:
+                known = next(cell for cell in of_row if cell is not None)
+                rows.append([f"{row}\n{_size(known)}", *texts, comparison.commands.get(row, "")])
+        header = ["", *columns, AGAIN]
+        if number == "2":
+            rows.append([AGAIN, *(comparison.commands.get(column, "") for column in columns)])
+            sizes = {column: _size(cell) for (_, column), cell in cells.items()}
+            header = ["", *(f"{column}\n{sizes[column]}" for column in columns)]
         if cells:
-            sheets.append((title, ["", *columns, *([] if number == "2" else [AGAIN])], rows))
+            sheets.append((title, header, rows))
     if comparison.claims:
         claims = [[one.text, one.verdict, _p(one.p), _p(one.seeds_p), one.detail] for one in comparison.claims]
         header = ["claim", "verdict", "exact test on the counts", "t test between seeds", "values"]
@@ -198,7 +217,10 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> T
 
 def markdown(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
-    lines = [f"**{title}**", "", "| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    shown = [[f"`{text}`" if text.startswith("make ") else text.replace("\n", "<br>") for text in row] for row in rows]
-    lines += ["| " + " | ".join(row) + " |" for row in shown]
+    shown = [
+        [f"`{text}`" if text.startswith("make ") else text.replace("\n", "<br>") for text in row]
+        for row in (header, *rows)
+    ]
+    lines = ["| " + " | ".join(row) + " |" for row in shown]
+    lines = [f"**{title}**", "", lines[0], "|" + "---|" * len(header), *lines[1:]]
     return "\n".join(lines) + "\n"

@@ -460,7 +460,6 @@ OF_STORE = [
     ("reference",),
     ("sample", *PAIR),
     ("figures",),
-    ("explain",),
     ("ui", "port=54321"),
 ]
 BROKEN = [

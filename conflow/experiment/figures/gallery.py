@@ -11,6 +11,7 @@ from torch import Tensor
 
 from conflow.experiment import diagnostics, record, tracking
 from conflow.experiment.build import random_stream
+from conflow.experiment.config import ConfigError
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import Evaluation, cycle
 from conflow.experiment.figures import curves, workspace
@@ -44,7 +45,11 @@ def draw(wanted: Sequence[str], console: Console) -> None:
 
 def draw_front(console: Console) -> None:
     """Draw what fewer collisions cost, of the published runs as they are at their presets."""
-    records = [one for one in record.from_files() if not one.changes()]
+    try:
+        records = [one for one in record.from_files() if not one.changes()]
+    except ConfigError as error:
+        console.print(f"front.png is left out; {error}", highlight=False, soft_wrap=True)
+        return
     workspace.save({"front": front(records)}, _folder() / "explain")
     console.print(
         f"front.png: unguided collisions of {len(records)} published runs, and what they cost", highlight=False
