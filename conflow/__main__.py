@@ -229,11 +229,11 @@ def _console() -> "Console":
 
 def _exit_code(error: BaseException) -> int:
     """Known failures end in one line on stderr and an exit code; anything else is a bug and raised."""
-    from conflow.experiment.signals import Interrupted
+    from conflow.experiment import signals
 
-    if isinstance(error, Interrupted):
-        print(f"conflow: interrupted by {error}", file=sys.stderr)
-        return error.exit_code
+    if interrupted := signals.arrived():
+        print(f"conflow: interrupted by {interrupted}", file=sys.stderr)
+        return interrupted.exit_code
     reason = _reason(error)
     if reason is None:
         raise error

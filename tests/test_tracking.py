@@ -1,6 +1,10 @@
+import io
 import os
 import shutil
 import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +12,12 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.artifacts import list_artifacts
 from mlflow.entities import Run
+from rich.console import Console
+from sqlalchemy import Engine, event
 
 from conflow.experiment import config, signals, tracking
 from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.progress import ProgressDisplay
 
 
 @pytest.fixture
@@ -76,6 +83,21 @@ def test_a_run_that_raises_is_failed_and_keeps_its_metrics(store_folder: Path) -
     assert run.data.metrics["train/loss"] == 0.5
 
 
+@contextmanager
+def raising_signals() -> Iterator[None]:
+    """Signals act in the block as in a command."""
+    handlers = {signum: signal.getsignal(signum) for signum in signals.SIGNALS}
+    unraisable = sys.unraisablehook
+    signals.raise_on_signals()
+    try:
+        yield
+    finally:
+        signals.RAISED.clear()
+        sys.unraisablehook = unraisable
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)
+
+
 def test_a_signal_while_the_store_makes_the_run_leaves_no_run_that_says_running(
     store_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,15 +114,88 @@ def test_a_signal_while_the_store_makes_the_run_leaves_no_run_that_says_running(
     monkeypatch.setattr(MlflowClient, "create_run", interrupted)
     settings = config.load(["preset=smoke"])
     data = DemonstrationData(settings)
-    handlers = {signum: signal.getsignal(signum) for signum in signals.SIGNALS}
-    signals.raise_on_signals()
-    try:
-        with pytest.raises(signals.Interrupted, match="SIGTERM"), tracking.start(settings, data):
-            pytest.fail("the run began")
-    finally:
-        for signum, handler in handlers.items():
-            signal.signal(signum, handler)
+    with (
+        raising_signals(),
+        pytest.raises(signals.Interrupted, match="SIGTERM"),
+        tracking.start(settings, data),
+    ):
+        pytest.fail("the run began")
     assert tracking.client().get_run(created[0]).info.status == "KILLED"
+
+
+@pytest.mark.parametrize("table", ["params", "datasets", "metrics"])
+def test_a_signal_within_a_transaction_of_the_store_leaves_no_run_that_says_running(
+    table: str, store_folder: Path
+) -> None:
+    """Raised in there, it would leave the transaction open, and the store locked for the run's own end."""
+    settings = config.load(["preset=smoke"])
+    data = DemonstrationData(settings)
+    sent: list[str] = []
+
+    def interrupt(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
+        if statement.startswith(f"INSERT INTO {table}") and not sent:
+            sent.append(statement)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def write() -> None:
+        with tracking.start(settings, data) as logger:
+            logger.log_metrics({"train/loss": 0.5}, 1)
+            logger.save()
+            pytest.fail("nothing interrupted it")
+
+    tracking.client()  # the store has its tables before
+    event.listen(Engine, "after_cursor_execute", interrupt)
+    try:
+        with raising_signals(), pytest.raises(signals.Interrupted, match="SIGTERM"):
+            write()
+    finally:
+        event.remove(Engine, "after_cursor_execute", interrupt)
+    assert sent
+    assert [run.info.status for run in tracking.runs()] == ["KILLED"]
+
+
+class Deaf:
+    """What is raised in a destructor, Python drops."""
+
+    def __del__(self) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_a_signal_that_python_drops_ends_the_run_all_the_same(store_folder: Path) -> None:
+    settings = config.load(["preset=smoke"])
+    data = DemonstrationData(settings)
+    with (
+        raising_signals(),
+        pytest.raises(signals.Interrupted, match="SIGTERM"),
+        tracking.start(settings, data),
+    ):
+        Deaf()
+    assert [run.info.status for run in tracking.runs()] == ["KILLED"]
+
+
+def test_long_work_notices_a_signal_that_python_dropped(capsys: pytest.CaptureFixture[str]) -> None:
+    with raising_signals(), ProgressDisplay(Console(file=io.StringIO())) as display:
+        task = display.add("training", 10)
+        display.update(task, 1)
+        Deaf()
+        with pytest.raises(signals.Interrupted, match="SIGTERM"):
+            display.update(task, 2)
+    assert capsys.readouterr().err == ""  # no traceback of it beside the one line that says so
+
+
+def test_a_signal_of_which_a_library_makes_another_error_ends_the_run_as_interrupted(store_folder: Path) -> None:
+    settings = config.load(["preset=smoke"])
+    data = DemonstrationData(settings)
+
+    def drawn() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except BaseException:
+            raise ValueError("Invalid affine transformation matrix") from None
+
+    with raising_signals(), pytest.raises(ValueError, match="Invalid affine"), tracking.start(settings, data):
+        drawn()
+    assert [run.info.status for run in tracking.runs()] == ["KILLED"]
 
 
 def test_a_run_is_found_by_its_id_its_name_or_its_preset_and_name(store_folder: Path) -> None:

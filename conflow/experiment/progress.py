@@ -5,6 +5,8 @@ import time
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from conflow.experiment import signals
+
 PLAIN_SECONDS = 10.0
 
 
@@ -39,7 +41,12 @@ class ProgressDisplay:
         return self.bars.add_task(name, total=total, note="")
 
     def update(self, task: TaskID, completed: float, note: str = "") -> None:
-        """So many steps are done; the note stands beside them."""
+        """So many steps are done; the note stands beside them.
+
+        Raises:
+            Interrupted: a signal asked this process to end, and was dropped where it was raised.
+        """
+        signals.check()
         state = self.bars.tasks[task]
         if state.finished:
             return

@@ -1,6 +1,7 @@
 """Signals that ask a command to end, as an exception."""
 
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -16,14 +17,40 @@ class Interrupted(BaseException):
         self.exit_code = 128 + signum
 
 
+RAISED: list[int] = []
+"""The signals that were raised so far."""
+
+
 def raise_on_signals() -> None:
     """From here on, Ctrl-C, SIGTERM and SIGHUP raise `Interrupted` in the main thread."""
+    RAISED.clear()
 
     def interrupt(signum: int, _: FrameType | None) -> None:
+        RAISED.append(signum)
         raise Interrupted(signum)
+
+    def unraisable(dropped: "sys.UnraisableHookArgs") -> None:
+        if not isinstance(dropped.exc_value, Interrupted):  # which `check` raises again
+            sys.__unraisablehook__(dropped)
 
     for signum in SIGNALS:
         signal.signal(signum, interrupt)
+    sys.unraisablehook = unraisable
+
+
+def arrived() -> Interrupted | None:
+    """What asked this process to end, if anything did, whatever became of the exception since.
+
+    Python drops what is raised in a destructor or in a weak reference's callback, and C code that calls back may make
+    another error of it.
+    """
+    return Interrupted(RAISED[0]) if RAISED else None
+
+
+def check() -> None:
+    """Raise again what was dropped. Long work calls this now and then."""
+    if interrupted := arrived():
+        raise interrupted
 
 
 @contextmanager

@@ -24,10 +24,10 @@ from mlflow.data.numpy_dataset import from_numpy
 from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
 from mlflow.exceptions import MlflowException
 
-from conflow.experiment import alive
+from conflow.experiment import alive, signals
 from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.signals import Interrupted, held
+from conflow.experiment.signals import held
 
 # MLflow tells every user about every table of a new store,
 logging.getLogger("mlflow.store.db.utils").setLevel(logging.WARNING)
@@ -163,6 +163,8 @@ def artifact(run: Run, name: str) -> Path:
 class RunLogger(MLFlowLogger):
     """Lightning's MLflow logger, except that metrics are written in batches and the run's status is left alone.
 
+    No signal interrupts a write: it would leave a transaction open, and so the store locked for the run's own end.
+
     Args:
         store: where the run is.
         run_id: the run.
@@ -173,6 +175,7 @@ class RunLogger(MLFlowLogger):
     def __init__(self, store: MlflowClient, run_id: str, again: bool = False) -> None:
         super().__init__(EXPERIMENT, tracking_uri=store_uri(), run_id=run_id)
         self.store = store
+        _ = self.experiment  # Lightning asks the store about it once: here, where no signal interrupts
         keys = store.get_run(run_id).data.metrics if again else ()
         self.written = {(key, point.step) for key in keys for point in store.get_metric_history(run_id, key)}
         self.buffer: list[Metric] = []
@@ -191,12 +194,18 @@ class RunLogger(MLFlowLogger):
     def log_hyperparams(self, *_: Any, **__: Any) -> None:
         """`start` has logged the whole config."""
 
+    @held()
     def save(self) -> None:
         """Write what is buffered."""
         for i in range(0, len(self.buffer), 1000):
             self.store.log_batch(str(self.run_id), metrics=self.buffer[i : i + 1000])
         self.buffer.clear()
         self.flushed = time.monotonic()
+
+    @held()
+    def log_files(self, folder: str) -> None:
+        """Make everything in a folder an artifact of the run."""
+        self.store.log_artifacts(str(self.run_id), folder)
 
     def finalize(self, status: str = "success") -> None:
         self.save()
@@ -219,7 +228,7 @@ def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -
     """
     store = client()
     logger: RunLogger | None = None
-    status = "FAILED"
+    status = "FINISHED"
     with alive.claim(RUNS / "running") as lock:
         try:
             # A signal between the store's commit and its answer would leave a run that nobody knows of to end.
@@ -228,9 +237,9 @@ def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -
                 logger = RunLogger(store, run_id, again=resumed is not None)
             _describe(store, run_id, config, data)
             yield logger
-            status = "FINISHED"
-        except Interrupted:
-            status = "KILLED"
+            signals.check()
+        except BaseException:
+            status = "KILLED" if signals.arrived() else "FAILED"
             raise
         finally:
             if logger is not None:
@@ -258,6 +267,7 @@ def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
     return run_id
 
 
+@held()
 def _describe(store: MlflowClient, run_id: str, config: Config, data: DemonstrationData) -> None:
     store.log_batch(run_id, params=[Param(key, str(value)) for key, value in flatten(config.tree()).items()])
     store.log_dict(run_id, config.tree(), CONFIG_FILE)

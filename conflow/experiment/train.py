@@ -67,7 +67,7 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
                 "sources": figures.sources(model, evaluation),
             }
             figures.save(pictures, Path(folder, "figures"))
-            logger.store.log_artifacts(run_id, folder)
+            logger.log_files(folder)
     shutil.rmtree(tracking.checkpoints(run_id))  # what a finished run needs is among its artifacts
     title = f"{config.ablation}-s{config.seed}, preset {config.preset}"
     console.print(report.results_table(evaluation.results, title))

@@ -73,6 +73,7 @@ def test_a_run_whose_process_is_gone_is_marked_by_the_next_command(module: str, 
 
 
 def test_a_failure_marks_the_run_failed_and_says_why_in_one_line(folder: Path) -> None:
+    (folder / "runs" / "checkpoints").mkdir(parents=True, exist_ok=True)
     (folder / "runs" / "checkpoints").rename(folder / "runs" / "kept")
     (folder / "runs" / "checkpoints").write_text("in the way")
     try:
