@@ -12,7 +12,8 @@ from rich.console import Console
 from scipy import stats
 
 from conflow.experiment import compare, config, report, tracking
-from conflow.experiment.compare import COLLISIONS, GUARDS, QUALITIES, Comparison
+from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, Cell
+from conflow.experiment.compare import Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
 
@@ -66,7 +67,7 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
         return compare.collect("smoke")
 
 
-def cell(comparison: Comparison, table: str, row: str, column: str) -> compare.Cell:
+def cell(comparison: Comparison, table: str, row: str, column: str) -> Cell:
     (found,) = [c for c in comparison.cells if (c.table, c.row, c.column) == (table, row, column)]
     return found
 
@@ -190,7 +191,7 @@ def patchy(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
         monkeypatch.chdir(tmp_path_factory.mktemp("patchy"))
-        monkeypatch.setitem(compare.METHODS, "removed", "an ablation whose file is gone, with a run")
+        monkeypatch.setitem(METHODS, "removed", "an ablation whose file is gone, with a run")
         tracking.client().set_tag(add_run("cgp", 7, 10, 0.1), "ablation", "removed")
         for seed in range(2):
             add_run("cgp", seed, 20, 0.01, lacking=(*guards, "smoothness_median", "robot_collision"))
@@ -200,9 +201,7 @@ def patchy(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
 
 
 def test_a_metric_that_a_run_lacks_leaves_its_cells_out_and_no_others(patchy: Comparison) -> None:
-    columns = {
-        row: [c.column for c in patchy.cells if (c.table, c.row) == ("3", row)] for row in compare.METHODS.values()
-    }
+    columns = {row: [c.column for c in patchy.cells if (c.table, c.row) == ("3", row)] for row in METHODS.values()}
     assert columns["ConFlow (D+ and D-)"] == ["diversity"]
     assert columns["FM (D+)"] == ["robot-collision rate", "diversity", "smoothness, median"]
     assert columns["ConFlow, Gaussian source"] == list(GUARDS.values())

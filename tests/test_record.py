@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import compare, record, report, tracking
+from conflow.experiment import compare, paper, record, report, tracking
+from conflow.experiment.cells import Cell
 from conflow.experiment.config import ConfigError, flatten, load
 from conflow.experiment.metrics import wilson
 from conflow.experiment.record import Record
@@ -33,7 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def cell(found: compare.Comparison, table: str, row: str, column: str) -> compare.Cell:
+def cell(found: compare.Comparison, table: str, row: str, column: str) -> Cell:
     (one,) = [c for c in found.cells if (c.table, c.row, c.column) == (table, row, column)]
     return one
 
@@ -46,13 +47,13 @@ def test_a_record_survives_its_file() -> None:
 
 
 def test_a_record_says_what_was_changed_and_nothing_else() -> None:
-    assert published("plus", 0, 1).changes() == []
-    assert published("cgp", 0, 1, "correction.lambda_c=10", "sample.num=100").changes() == [
+    assert published("plus", 0, 1).changes == []
+    assert published("cgp", 0, 1, "correction.lambda_c=10", "sample.num=100").changes == [
         "correction.lambda_c=10.0",
         "sample.num=100",
     ]
     # As an argument again; Python's None is no value of a setting.
-    assert published("spectral", 0, 1, "source.modes=null").changes() == ["source.modes=null"]
+    assert published("spectral", 0, 1, "source.modes=null").changes == ["source.modes=null"]
 
 
 def test_a_setting_that_came_later_counts_as_its_default() -> None:
@@ -61,7 +62,7 @@ def test_a_setting_that_came_later_counts_as_its_default() -> None:
     content = json.loads(path.read_text())
     del content["settings"]["correction.edges"]
     path.write_text(json.dumps(content))
-    assert Record.read(path).changes() == made.changes() == []
+    assert Record.read(path).changes == made.changes == []
 
 
 def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
@@ -156,9 +157,9 @@ def test_reasons_are_of_the_columns_that_differ() -> None:
     published("no_negatives", 0, 40)  # as the paper's 0.043, and not its 0.004
     published("fm_mixed", 0, 270)  # guided as the paper's 0.27
     (found,) = compare.collect_reference()
-    assert found.reasons["ConFlow (D+ and D-)"] == f"{compare.UNGUIDED['cgp']}; {compare.GUIDED}"
-    assert found.reasons["ConFlow (D+)"] == compare.GUIDED
-    assert found.reasons["FM (D+ and D-)"] == compare.UNGUIDED["fm_mixed"]
+    assert found.reasons["ConFlow (D+ and D-)"] == f"{paper.UNGUIDED['cgp']}; {paper.GUIDED}"
+    assert found.reasons["ConFlow (D+)"] == paper.GUIDED
+    assert found.reasons["FM (D+ and D-)"] == paper.UNGUIDED["fm_mixed"]
 
 
 def test_a_rate_is_tested_against_the_papers_count_of_256() -> None:
@@ -214,4 +215,4 @@ def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
     (path,) = record.publish("smoke")
     made = Record.read(path)
     assert (made.run_id, made.metrics, made.origin) == (run_id, {"test/none/num": 10}, {"git_sha": "abc"})
-    assert made.changes() == []
+    assert made.changes == []

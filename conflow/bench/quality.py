@@ -10,7 +10,7 @@ from mlflow.entities import Run
 from conflow.bench.clock import Row, alone
 from conflow.experiment import config, tracking
 from conflow.experiment.callbacks import VALIDATION_SAMPLES
-from conflow.experiment.compare import METHODS
+from conflow.experiment.cells import METHODS
 from conflow.experiment.figures.curves import MARK
 from conflow.experiment.figures.front import COLOURS, MARKERS
 from conflow.experiment.record import Record
@@ -55,7 +55,7 @@ def curves(preset: str) -> list[Curve]:
         key = run.data.tags["ablation"], int(run.data.tags["seed"])
         if key in newest or key[0] not in config.names("ablation") or "train/seconds" not in run.data.metrics:
             continue
-        if all(change.startswith(ALSO) for change in Record.of(run).changes()):
+        if all(change.startswith(ALSO) for change in Record.of(run).changes):
             newest[key] = _curve(run)
     rank = {ablation: i for i, ablation in enumerate(METHODS)}
     return sorted(newest.values(), key=lambda one: (rank.get(one.ablation, len(rank)), one.ablation, one.seed))

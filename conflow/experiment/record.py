@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 from mlflow.entities import Run
@@ -65,12 +66,13 @@ class Record:
     def write(self, folder: Path) -> Path:
         """The file of this record in a folder; where one of another run of the same experiment was, it is replaced."""
         # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
-        name = re.sub(r"[^\w.=+-]+", "_", "-".join([self.ablation, self.preset, *self.changes(), f"s{self.seed}"]))
+        name = re.sub(r"[^\w.=+-]+", "_", "-".join([self.ablation, self.preset, *self.changes, f"s{self.seed}"]))
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{name}.json"
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
         return path
 
+    @cached_property
     def changes(self) -> list[str]:
         """The settings that are not those of the ablation at the preset, as arguments."""
         named = flatten(config.load([f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]).tree())

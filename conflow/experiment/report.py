@@ -3,14 +3,15 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any, Literal, cast, get_args
 
 from rich.console import Console
 from rich.table import Table
 
-from conflow.experiment.compare import COLLISIONS, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell, Comparison
+from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell, digits
+from conflow.experiment.compare import Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.evaluation import Metrics
 from conflow.experiment.module import Setting
@@ -43,17 +44,22 @@ def results_table(results: dict[Setting, Metrics], title: str) -> Table:
     for setting in results:
         made.add_column(setting, justify="right")
     for key, label in ROWS.items():
-        made.add_row(label, *(_estimate(metrics, key) for metrics in results.values()))
+        made.add_row(label, *(_result(metrics, key) for metrics in results.values()))
     made.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
     return made
 
 
-def _estimate(metrics: Metrics, key: str) -> str:
+def _result(metrics: Metrics, key: str) -> str:
     """The value over its interval; nothing where the metric was left out."""
     if key not in metrics:
         return ""
-    stem = key.removesuffix("_rate")
-    return f"{metrics[key]:.4f}\n[dim]\\[{metrics[f'{stem}_low']:.4f}, {metrics[f'{stem}_high']:.4f}][/dim]"
+    low, high = (metrics[f"{key.removesuffix('_rate')}_{end}"] for end in ("low", "high"))
+    return f"{digits(metrics[key])}\n[dim]\\[{digits(low)}, {digits(high)}][/dim]"
+
+
+def _estimate(value: float, low: float | None, high: float | None) -> str:
+    """The value and, where there is one, its interval."""
+    return digits(value) if low is None or high is None else f"{digits(value)} [{digits(low)}, {digits(high)}]"
 
 
 def checked_format(name: str) -> Format:
@@ -130,7 +136,8 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
 
 
 def _rate(cell: Cell) -> str:
-    return f"{cell.value:.4f} [{cell.low:.4f}, {cell.high:.4f}]\n{cell.count} of {cell.trajectories}, {_seeds(cell)}"
+    estimate = _estimate(cell.value, cell.low, cell.high)
+    return f"{estimate}\n{cell.count} of {cell.trajectories}, {_seeds(cell)}"
 
 
 def _size(cell: Cell) -> str:
@@ -142,41 +149,55 @@ def _seeds(cell: Cell) -> str:
 
 
 def _sheets(comparison: Comparison) -> list[Sheet]:
-    """Title, header and rows of the tables and of the claims, as text."""
-    tables = {
-        "1": ("Table 1: collision rates (setting: what is hit)", COLLISIONS),
-        "2": ("Table 2: sources, without guidance", QUALITIES | SMOOTHNESS),
-        "3": ("Table 3: quality without guidance", GUARDS),
-        "4": ("Table 4: what the paper leaves open, changed one at a time", READINGS),
-    }
-    sheets = []
-    for number, (title, metrics) in tables.items():
-        cells = {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == number}
-        columns = _ordered((column for _, column in cells), metrics.values())
-        rows = []
-        for row in _ordered((row for row, _ in cells), metrics.values()):
-            of_row = [cells.get((row, column)) for column in columns]
-            texts = [_text(cell) if cell else "" for cell in of_row]
-            if number == "2":  # whose columns are the methods
-                rows.append([row, *texts])
-            else:
-                known = next(cell for cell in of_row if cell is not None)
-                rows.append([f"{row}\n{_size(known)}", *texts, comparison.commands.get(row, "")])
-        header = ["", *columns, AGAIN]
-        if number == "2":
-            rows.append([AGAIN, *(comparison.commands.get(column, "") for column in columns)])
-            sizes = {column: _size(cell) for (_, column), cell in cells.items()}
-            header = ["", *(f"{column}\n{sizes[column]}" for column in columns)]
-        if cells:
-            sheets.append((title, header, rows))
-    if comparison.claims:
-        claims = [[one.text, one.verdict, _p(one.p), _p(one.seeds_p), one.detail] for one in comparison.claims]
-        header = ["claim", "verdict", "exact test on the counts", "t test between seeds", "values"]
-        sheets.append(("Claims, the paper's first", header, claims))
-    if comparison.reasons:
-        differing = [list(pair) for pair in comparison.reasons.items()]
-        sheets.append(("Where Table 1 differs from the paper's", ["row", "the most likely reason"], differing))
-    return [(f"{title}, preset {comparison.preset}", header, rows) for title, header, rows in sheets]
+    """The tables that have cells, the claims, and the reasons."""
+    sheets = [
+        _methods_down(comparison, "1", "Table 1: collision rates (setting: what is hit)", COLLISIONS),
+        _methods_across(comparison, "2", "Table 2: sources, without guidance", QUALITIES | SMOOTHNESS),
+        _methods_down(comparison, "3", "Table 3: quality without guidance", GUARDS),
+        _methods_down(comparison, "4", "Table 4: what the paper leaves open, changed one at a time", READINGS),
+        (
+            "Claims, the paper's first",
+            ["claim", "verdict", "exact test on the counts", "t test between seeds", "values"],
+            [[one.text, one.verdict, _p(one.p), _p(one.seeds_p), one.detail] for one in comparison.claims],
+        ),
+        (
+            "Where Table 1 differs from the paper's",
+            ["row", "the most likely reason"],
+            [[row, reason] for row, reason in comparison.reasons.items()],
+        ),
+    ]
+    return [(f"{title}, preset {comparison.preset}", header, rows) for title, header, rows in sheets if rows]
+
+
+def _methods_down(comparison: Comparison, number: str, title: str, metrics: Mapping[str, str]) -> Sheet:
+    """A table with a row for each method: its size, its numbers, and what makes it again."""
+    cells = _cells(comparison, number)
+    columns = _ordered((column for _, column in cells), metrics.values())
+    rows = []
+    for method in dict.fromkeys(row for row, _ in cells):
+        of_method = [cells.get((method, column)) for column in columns]
+        size = next(_size(cell) for cell in of_method if cell)
+        texts = [_text(cell) if cell else "" for cell in of_method]
+        rows.append([f"{method}\n{size}", *texts, comparison.commands.get(method, "")])
+    return title, ["", *columns, AGAIN], rows
+
+
+def _methods_across(comparison: Comparison, number: str, title: str, metrics: Mapping[str, str]) -> Sheet:
+    """A table with a column for each method, under its size and over what makes it again."""
+    cells = _cells(comparison, number)
+    sizes = {method: _size(cell) for (_, method), cell in cells.items()}
+    rows = []
+    for metric in _ordered((row for row, _ in cells), metrics.values()):
+        of_metric = [cells.get((metric, method)) for method in sizes]
+        rows.append([metric, *(_text(cell) if cell else "" for cell in of_metric)])
+    if rows:
+        rows.append([AGAIN, *(comparison.commands.get(method, "") for method in sizes)])
+    return title, ["", *(f"{method}\n{size}" for method, size in sizes.items())], rows
+
+
+def _cells(comparison: Comparison, number: str) -> dict[tuple[str, str], Cell]:
+    """A table's cells by row and column."""
+    return {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == number}
 
 
 def _p(p: float | None) -> str:
@@ -192,13 +213,11 @@ def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
 
 
 def _text(cell: Cell) -> str:
-    parts = [f"{cell.value:.4f}"]
-    if cell.low is not None:
-        parts[0] += f" [{cell.low:.4f}, {cell.high:.4f}]"
+    parts = [_estimate(cell.value, cell.low, cell.high)]
     if cell.count is not None:
         parts.append(f"{cell.count} of {cell.trajectories}")
     if cell.seeds > 1:
-        parts.append(f"seeds {cell.seed_low:.4f} to {cell.seed_high:.4f}")
+        parts.append(f"seeds {digits(cell.seed_low)} to {digits(cell.seed_high)}")
     if cell.paper is not None:
         agrees = "" if cell.paper_p is None else ", differs" if cell.differs else ", not distinguishable"
         parts.append(f"paper {cell.paper:.4g}{agrees}")

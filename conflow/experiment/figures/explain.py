@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from torch import Tensor
 
-from conflow.experiment import config, tracking
+from conflow.experiment import config, paper, tracking
 from conflow.experiment.build import build_source, fitted, random_stream, robot_avoidance
 from conflow.experiment.closed_form import Way, coordinates, expected, minimiser, posterior, whitened
 from conflow.experiment.config import Config
@@ -38,7 +38,7 @@ CLEARED = 0.9
 SHAPES = 5
 SAMPLES, SAMPLE_STEPS = 512, 100
 WEIGHTS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0)
-PAPERS, PAPER_RATE = "filter, the paper's", 0.016
+PAPERS, PAPER_RATE = "filter, the paper's", paper.TABLE_1["cgp"][0]
 
 
 def draw(settings: Config, console: Console) -> None:

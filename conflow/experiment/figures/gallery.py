@@ -46,7 +46,7 @@ def draw(wanted: Sequence[str], console: Console) -> None:
 def draw_front(console: Console) -> None:
     """Draw what fewer collisions cost, of the published runs as they are at their presets."""
     try:
-        records = [one for one in record.from_files() if not one.changes()]
+        records = [one for one in record.from_files() if not one.changes]
     except ConfigError as error:
         console.print(f"front.png is left out; {error}", highlight=False, soft_wrap=True)
         return
