@@ -1,5 +1,6 @@
 """What the pictures of the theory show, compared with numbers computed another way."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,14 @@ from rich.console import Console
 
 from conflow.experiment import config
 from conflow.experiment.build import build_source, robot_avoidance
+from conflow.experiment.cells import METHODS, Cell
+from conflow.experiment.claims import Claim
 from conflow.experiment.closed_form import expected, minimiser, posterior
+from conflow.experiment.compare import Comparison
 from conflow.experiment.config import Config
 from conflow.experiment.figures import explain, gallery
 from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations
-from conflow.experiment.figures.front import front
-from conflow.experiment.record import Record
+from conflow.experiment.figures.front import DISTANCE, RATE, front
 from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter
 from conflow.scene.constraint import Barrier
@@ -272,22 +275,24 @@ def test_explain_takes_a_preset_alone(conflow: Command) -> None:
         assert answer.stderr.count("\n") == 1
 
 
-def record(ablation: str, preset: str, seed: int, count: int, distance: float | None) -> Record:
-    metrics = {"test/none/robot_collision_count": count, "test/none/num": 1000.0}
-    metrics |= {} if distance is None else {"test/none/energy_distance": distance}
-    return Record("id", ablation, preset, seed, {}, metrics, {}, 60.0)
+def published(preset: str, *rates: tuple[str, int, float | None]) -> Comparison:
+    """Of methods at a preset, how many of 1,000 collide and the energy distance."""
+    cells = []
+    for method, count, distance in rates:
+        rate = Cell("3", method, RATE, None, count / 1000, 0, 1, 0, 1, 1, count, 1000, preset, None)
+        cells += [rate] if distance is None else [rate, replace(rate, column=DISTANCE, value=distance)]
+    return Comparison(preset, cells, [Claim("", "no runs", None, None, "")], {}, {}, "", {})
 
 
-def test_the_front_has_a_point_for_each_ablation_and_preset() -> None:
-    """Rates are pooled over seeds, distances averaged; runs without a distance are left out."""
-    runs = [record("cgp", "quick", seed, 300 + seed, 0.03 + 0.01 * seed) for seed in range(3)]
-    runs += [record("cgp", "long", 0, 16, 0.0), record("fm", "quick", 0, 270, None)]
-    (axis,) = front(runs).axes
+def test_the_front_has_a_point_for_each_method_and_preset() -> None:
+    """Those without a distance are left out."""
+    quick = published("quick", (METHODS["cgp"], 301, 0.04), (METHODS["fm"], 270, None))
+    (axis,) = front([published("long", (METHODS["cgp"], 16, 0.0)), quick]).axes
     assert points(axis) == {
-        "cgp, quick": [pytest.approx([0.04, 0.301])],
-        "cgp, long": [pytest.approx([0.0, 0.016])],
+        "ConFlow (D+ and D-), quick": [pytest.approx([0.04, 0.301])],
+        "ConFlow (D+ and D-), long": [pytest.approx([0.0, 0.016])],
     }
-    assert {text.get_text() for text in axis.texts} == {"cgp"}
+    assert {text.get_text() for text in axis.texts} == {"ConFlow (D+ and D-)"}
 
 
 def test_without_published_runs_the_front_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -259,7 +259,7 @@ def finished(place: Path, monkeypatch: pytest.MonkeyPatch, data: DemonstrationDa
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "page.png").write_bytes(b"of training")
     with tracking.start(flow.config, data) as logger:
-        logger.store.log_artifacts(str(logger.run_id), str(tmp_path))
+        logger.log_files(str(tmp_path))
     return tracking.find_run(str(logger.run_id))
 
 
@@ -267,7 +267,7 @@ def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
     finished: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workspace, "DPI", 20)
-    folder = Path("runs/figures/cgp-s77")
+    folder = Path("runs/figures/smoke_cgp-s77")
     folder.mkdir(parents=True)
     (folder / "mine.txt").write_text("kept")
     (folder / "flow.png").write_text("of an earlier call")
@@ -292,7 +292,7 @@ def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
     monkeypatch.setattr(gallery, "_log", lambda *_: None)
     tracking.client().update_run(finished.info.run_id, name="../../elsewhere")
     gallery.draw([finished.info.run_id, "latest"], Console(quiet=True))
-    assert {path.parent for path in saved} == {Path("runs/figures/_elsewhere"), Path("runs/figures")}
+    assert {path.parent for path in saved} == {Path("runs/figures/smoke_.._.._elsewhere"), Path("runs/figures")}
     assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png", "taken_back.png"]
 
 

@@ -149,7 +149,7 @@ def test_a_run_cannot_be_named_out_of_the_folder_of_pictures(
     assert (outcome.code, outcome.err) == (0, "")
     new = {Path(path) for path in set(listing(tmp_path)) - before}
     own = (Path("a/b/runs/figures"), Path("a/b/runs/artifacts", run.info.run_id))
-    assert Path("a/b/runs/figures/_x/page.png") in new
+    assert Path("a/b/runs/figures/smoke_.._.._x/page.png") in new
     assert {path for path in new if not any(path.is_relative_to(folder) for folder in own)} <= {
         Path("a/b/runs/running")
     }

@@ -67,11 +67,11 @@ def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Fig
     return figure
 
 
-def taken_back(shares: Mapping[str, Tensor]) -> Figure:
+def taken_back(shares: Sequence[tuple[str, Tensor]]) -> Figure:
     """How much of a push along grad C the velocity takes back in each mode of the source, a line for each name."""
     figure = Figure(figsize=(7.2, 5.4), layout="constrained")
     axis = figure.subplots()
-    for name, share in shares.items():
+    for name, share in shares:
         axis.plot(range(1, 1 + len(share[:MODES])), share[:MODES], marker="o", ms=4, label=name)
     for value in (0, 1):
         axis.axhline(value, color=MARK, lw=0.8, ls=":")

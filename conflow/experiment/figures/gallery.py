@@ -9,7 +9,7 @@ from mlflow.entities import Run
 from rich.console import Console
 from torch import Tensor
 
-from conflow.experiment import diagnostics, record, tracking
+from conflow.experiment import compare, diagnostics, tracking
 from conflow.experiment.build import random_stream
 from conflow.experiment.config import ConfigError
 from conflow.experiment.datamodule import DemonstrationData
@@ -19,6 +19,7 @@ from conflow.experiment.figures.animation import animation
 from conflow.experiment.figures.front import front
 from conflow.experiment.finished import MODEL_FILE, demonstrations, load_model
 from conflow.experiment.module import SETTINGS, ConFlow, start_and_goal
+from conflow.experiment.record import Record
 
 NUM = 512
 TIMES = (0.3, 0.6, 0.9)
@@ -34,11 +35,13 @@ def draw(wanted: Sequence[str], console: Console) -> None:
         ConfigError: there is no such run.
     """
     runs = [tracking.find_run(name) for name in wanted]
-    made = {name: _draw_run(run, console) for name, run in zip(wanted, runs, strict=True)}
+    made = [(_title(run), *_draw_run(run, console)) for run in runs]
     if len(made) > 1:
         console.print("all runs: methods.png, taken_back.png", highlight=False)
-        methods = workspace.methods([(name, model, evaluation) for name, (model, evaluation, _) in made.items()])
-        taken_back = curves.taken_back({name: shares for name, (_, _, shares) in made.items()})
+        methods = workspace.methods([(title, model, evaluation) for title, model, evaluation, _ in made])
+        taken_back = curves.taken_back(
+            [(_collisions(title, model, evaluation), shares) for title, model, evaluation, shares in made]
+        )
         taken_back.axes[0].set_title(f"what the velocity takes back by t = 1, at t = {COMPARED}")
         workspace.save({"methods": methods, "taken_back": taken_back}, _folder())
 
@@ -46,14 +49,24 @@ def draw(wanted: Sequence[str], console: Console) -> None:
 def draw_front(console: Console) -> None:
     """Draw what fewer collisions cost, of the published runs as they are at their presets."""
     try:
-        records = [one for one in record.from_files() if not one.changes]
+        published = compare.collect_reference()
     except ConfigError as error:
         console.print(f"front.png is left out; {error}", highlight=False, soft_wrap=True)
         return
-    workspace.save({"front": front(records)}, _folder() / "explain")
-    console.print(
-        f"front.png: unguided collisions of {len(records)} published runs, and what they cost", highlight=False
-    )
+    workspace.save({"front": front(published)}, _folder() / "explain")
+    console.print("front.png: unguided collisions of the published runs, and what they cost", highlight=False)
+
+
+def _title(run: Run) -> str:
+    """A run's preset and name, and what sets it apart from its ablation."""
+    one = Record.of(run)
+    return " ".join([f"{one.preset}/{run.info.run_name}", *one.changes])
+
+
+def _collisions(title: str, model: ConFlow, evaluation: Evaluation) -> str:
+    """The title, and how many of the trajectories without guidance collide."""
+    collide = model.robots.violation(evaluation.samples["none"])
+    return f"{title}: {int(collide.sum())} of {len(collide)} collide"
 
 
 def _folder() -> Path:
@@ -66,7 +79,7 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
     data = demonstrations(run, model.config)
     name = str(run.info.run_name)
     # A name given in MLflow's pages may hold anything, also a way out of the folder.
-    folder = _folder() / re.sub(r"[^\w-]+", "_", name)
+    folder = _folder() / re.sub(r"[^\w.=-]+", "_", _title(run))
     console.print(f"{name}: {NUM} trajectories under each setting", highlight=False)
     evaluation = sample(model, data)
     x_0, x_1 = evaluation.source_samples, cycle(data.test.x, NUM)
@@ -78,7 +91,7 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
         "page": lambda: workspace.page(model, data, evaluation),
         "flow": lambda: workspace.flow(model, x_0, ends),
         "distances": lambda: workspace.distances(model, evaluation),
-        "taken_back": lambda: curves.taken_back({f"t = {t}": share for t, share in shares.items()}),
+        "taken_back": lambda: curves.taken_back([(f"t = {t}", share) for t, share in shares.items()]),
         "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in SETTINGS}),
         "solver_steps": lambda: curves.solver_steps(model, x_0, ends),
         "guidance_weight": lambda: curves.guidance_weight(model, x_0, ends),
