@@ -126,7 +126,23 @@ def test_one_seed_says_nothing_of_another(tmp_path: Path, monkeypatch: pytest.Mo
     found = claims["CGP beats Gaussian: smoothness, median"]
     assert (found.verdict, found.p, found.seeds_p) == ("too few seeds", None, None)
     rate = claims["CGP beats Gaussian: collision rate"]
-    assert (rate.verdict, rate.seeds_p) == ("holds", None)  # of these networks, by their counts
+    assert (rate.verdict, rate.seeds_p) == ("holds for these networks", None)  # by their counts
+
+
+def test_seeds_that_differ_more_than_the_methods_decide_a_rate_for_these_networks_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    for seed, (conflow, fm) in enumerate([(10, 100), (300, 310), (200, 260)]):
+        add_run("cgp", seed, conflow, 0.01)
+        add_run("fm", seed, fm, 0.01)
+    claims = {claim.text: claim for claim in compare.collect("smoke").claims}
+    found = claims["ConFlow collides less than FM, without guidance"]
+    assert found.p is not None
+    assert found.seeds_p is not None
+    assert found.p < 0.05 < found.seeds_p
+    assert found.verdict == "holds for these networks"
 
 
 def test_runs_that_cannot_have_these_arguments_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,7 +127,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     assert [cell(found, "4", change, "none: robot").count for found in (paper, quick)] == [280, 290]
     assert [cell(found, "1", "ConFlow (D+ and D-)", "none: robot").count for found in (long, quick)] == [16, 300]
     verdicts = [next(iter(found.claims)).verdict for found in (long, quick)]
-    assert verdicts == ["no runs", "reversed"]
+    assert verdicts == ["no runs", "reversed for these networks"]
     assert (paper.claims, {each.table for each in paper.cells}) == ([], {"4"})
     assert "PRESET=paper ARGS='train.batch_size=512'" in paper.commands[change]
     console = Console(width=400)
@@ -144,7 +144,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
         report.render([long, quick, paper], "json", console)
     tree = json.loads(captured.get())
     assert [each["preset"] for each in tree["cells"]] == [c.preset for one in (long, quick, paper) for c in one.cells]
-    assert tree["presets"]["quick"]["claims"][0]["verdict"] == "reversed"
+    assert tree["presets"]["quick"]["claims"][0]["verdict"] == "reversed for these networks"
     titles = [line.strip("*") for line in text.splitlines() if line.startswith("**Table")]
     assert [title[6] + title.rsplit(" ", 1)[1] for title in titles] == [
         *("1long", "2long", "3long", "4long", "1quick", "2quick", "3quick", "4quick", "4paper")

@@ -10,7 +10,15 @@ from scipy import stats
 from conflow.experiment.cells import COLLISIONS, LEVEL, QUALITIES, cell, digits, fisher_p, per_seed
 from conflow.experiment.record import Record
 
-Verdict = Literal["holds", "reversed", "not distinguishable", "too few seeds", "no runs"]
+Verdict = Literal[
+    "holds",
+    "reversed",
+    "holds for these networks",
+    "reversed for these networks",
+    "not distinguishable",
+    "too few seeds",
+    "no runs",
+]
 
 
 @dataclass(frozen=True)
@@ -18,7 +26,8 @@ class Claim:
     """A sentence "a is lower than b", and what the runs say to it.
 
     Attributes:
-        verdict: of a rate by Fisher's exact test on the counts, else by the test between seeds.
+        verdict: of a rate by Fisher's exact test on the counts, "for these networks" where the test between seeds does
+            not say the same; of anything else by the test between seeds.
         p: of Fisher's exact test, of a rate. It speaks of the networks that were trained, not of others.
         seeds_p: of Welch's t test on the values of the seeds; none where there are too few to have a spread.
     """
@@ -69,14 +78,25 @@ def _compare(runs: Mapping[str, list[Record]], text: str, lower: str, higher: st
     if a.count is not None and b.count is not None:
         p = fisher_p(a.count, a.trajectories, b.count, b.trajectories)
     detail = f"{digits(a.value)} against {digits(b.value)}, {a.seeds} and {b.seeds} seeds"
-    return Claim(text, _verdict(a.value, b.value, seeds_p if p is None else p), p, seeds_p, detail)
+    return Claim(text, _verdict(a.value < b.value, p, seeds_p), p, seeds_p, detail)
 
 
-def _verdict(a: float, b: float, p: float | None) -> Verdict:
-    """On "a is lower than b"."""
-    if p is None:
+def _verdict(lower: bool, p: float | None, seeds_p: float | None) -> Verdict:
+    """On "a is lower than b", where it is or is not.
+
+    Args:
+        lower: whether a's value is.
+        p: of the exact test, of a rate.
+        seeds_p: of the test between seeds, unless there are too few.
+    """
+    deciding = seeds_p if p is None else p
+    if deciding is None:
         return "too few seeds"
-    return "not distinguishable" if p >= LEVEL or a == b else "holds" if a < b else "reversed"
+    if deciding >= LEVEL:
+        return "not distinguishable"
+    if seeds_p is None or seeds_p >= LEVEL:
+        return "holds for these networks" if lower else "reversed for these networks"
+    return "holds" if lower else "reversed"
 
 
 def _welch_p(a: Sequence[float], b: Sequence[float]) -> float | None:
