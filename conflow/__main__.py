@@ -206,6 +206,8 @@ class Parser(argparse.ArgumentParser):
 
 def main() -> None:
     """Run one command; exit with 0, with 2 and one line for a known failure, or with 128 + a signal."""
+    from conflow.experiment import signals
+
     parser = Parser("conflow", description="Constraint-guided flow matching for robot motion.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, function in COMMANDS.items():
@@ -214,6 +216,7 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         COMMANDS[arguments.command](arguments.settings)
+        signals.check()
         sys.stdout.flush()  # what the output says to this is said here, not after the end
     except BaseException as error:
         sys.exit(_exit_code(error))

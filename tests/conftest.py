@@ -1,12 +1,14 @@
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from conflow.experiment import config
+from conflow.experiment import config, signals
 from conflow.experiment.config import Config
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -34,3 +36,19 @@ def conflow(workplace: Path) -> Command:
 def smoke() -> Config:
     """The smallest experiment."""
     return config.load(["preset=smoke"])
+
+
+@contextmanager
+def raising_signals() -> Iterator[None]:
+    """Signals act in the block as in a command."""
+    signals.forget()
+    handlers = {signum: signal.getsignal(signum) for signum in signals.SIGNALS}
+    unraisable = sys.unraisablehook
+    signals.raise_on_signals()
+    try:
+        yield
+    finally:
+        signals.forget()
+        sys.unraisablehook = unraisable
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)

@@ -296,6 +296,17 @@ def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
     assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png", "taken_back.png"]
 
 
+def test_runs_of_one_name_are_told_apart_by_preset_and_by_what_was_changed(finished: Run) -> None:
+    titles = []
+    for key, value in {"": "", "preset": "quick", "ablation": "removed"}.items():
+        if key:
+            tracking.client().set_tag(finished.info.run_id, key, value)
+        titles.append(gallery._title(tracking.client().get_run(finished.info.run_id)))
+    assert titles[0] == "smoke/cgp-s77"
+    assert titles[1].startswith("quick/cgp-s77 data.num=500 ")
+    assert titles[2] == "quick/cgp-s77"  # whose ablation's file is gone, so what was changed is not known
+
+
 def test_a_second_call_draws_the_same_samples(data: DemonstrationData, evaluation: Evaluation) -> None:
     again = gallery.sample(model("sample.robot_weight=2"), data)
     assert torch.equal(again.source_samples, evaluation.source_samples)

@@ -1,12 +1,18 @@
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
-from conflow.experiment import config
-from conflow.experiment.grid import Cell, _listen
+from conflow.experiment import config, signals
+from conflow.experiment.grid import Cell, _listen, _train_all
+from tests.conftest import raising_signals
 
 GRID = ["ablations", "preset=smoke", "seeds=0", "ablations=cgp fm"]
 
@@ -38,3 +44,32 @@ def test_a_cells_progress_is_read_from_what_it_prints() -> None:
         assert cell.share == pytest.approx(share)
     _listen(cell, "conflow: something else")
     assert cell.output[-1] == "conflow: something else"
+
+
+def test_a_cell_that_was_only_being_started_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not among the processes yet when the signal comes, and would train to its end."""
+    started: list[subprocess.Popen[str]] = []
+    popen = subprocess.Popen
+
+    def slow(_: object, **options: Any) -> "subprocess.Popen[str]":
+        time.sleep(1)
+        started.append(popen([sys.executable, "-c", "import time; time.sleep(600)"], **options))
+        return started[0]
+
+    monkeypatch.setattr(subprocess, "Popen", slow)
+    with raising_signals():
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with pytest.raises(signals.Interrupted, match="SIGTERM"):
+            _train_all([Cell([], config.load())], 1, Console(quiet=True))
+    assert started[0].returncode == -signal.SIGTERM
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_cell_that_cannot_be_started_and_those_after_it_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    cells = [Cell([], config.load()) for _ in range(3)]
+    _train_all(cells, 1, Console(quiet=True))
+    assert [cell.failed for cell in cells] == [True] * 3

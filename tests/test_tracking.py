@@ -2,9 +2,7 @@ import io
 import os
 import shutil
 import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from sqlalchemy import Engine, event
 from conflow.experiment import config, signals, tracking
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.progress import ProgressDisplay
+from tests.conftest import raising_signals
 
 
 @pytest.fixture
@@ -47,7 +46,8 @@ def test_artifacts_are_found_again_after_the_folder_has_moved(
     assert uri.startswith((after / "runs" / "artifacts").as_uri())
 
 
-def test_metrics_are_written_in_batches_and_none_is_lost(store_folder: Path) -> None:
+def test_metrics_are_written_in_batches_and_none_is_lost(store_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracking, "FLUSH_SECONDS", 3600)  # however slow the machine is
     settings = config.load(["preset=smoke"])
     with tracking.start(settings, DemonstrationData(settings)) as logger:
         written: list[int] = []
@@ -61,7 +61,7 @@ def test_metrics_are_written_in_batches_and_none_is_lost(store_folder: Path) -> 
         for step in range(2500):
             logger.log_metrics({"train/loss": 1 / (step + 1)}, step)
     assert sum(written) == 2500
-    assert len(written) <= 4  # 1,000 in a batch; one more if five seconds have passed
+    assert written == [1000, 1000, 500]
     history = logger.store.get_metric_history(str(logger.run_id), "train/loss")
     assert [metric.step for metric in history] == list(range(2500))
 
@@ -81,21 +81,6 @@ def test_a_run_that_raises_is_failed_and_keeps_its_metrics(store_folder: Path) -
     run = tracking.client().get_run(ids[0])
     assert run.info.status == "FAILED"
     assert run.data.metrics["train/loss"] == 0.5
-
-
-@contextmanager
-def raising_signals() -> Iterator[None]:
-    """Signals act in the block as in a command."""
-    handlers = {signum: signal.getsignal(signum) for signum in signals.SIGNALS}
-    unraisable = sys.unraisablehook
-    signals.raise_on_signals()
-    try:
-        yield
-    finally:
-        signals.RAISED.clear()
-        sys.unraisablehook = unraisable
-        for signum, handler in handlers.items():
-            signal.signal(signum, handler)
 
 
 def test_a_signal_while_the_store_makes_the_run_leaves_no_run_that_says_running(
@@ -124,18 +109,17 @@ def test_a_signal_while_the_store_makes_the_run_leaves_no_run_that_says_running(
 
 
 @pytest.mark.parametrize("table", ["params", "datasets", "metrics"])
-def test_a_signal_within_a_transaction_of_the_store_leaves_no_run_that_says_running(
-    table: str, store_folder: Path
-) -> None:
+def test_a_signal_breaks_off_no_transaction_of_the_store(table: str, store_folder: Path) -> None:
     """Raised in there, it would leave the transaction open, and the store locked for the run's own end."""
     settings = config.load(["preset=smoke"])
     data = DemonstrationData(settings)
     sent: list[str] = []
 
     def interrupt(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
-        if statement.startswith(f"INSERT INTO {table}") and not sent:
+        if statement.startswith(f"INSERT INTO {table}"):
+            if not sent:
+                os.kill(os.getpid(), signal.SIGTERM)
             sent.append(statement)
-            os.kill(os.getpid(), signal.SIGTERM)
 
     def write() -> None:
         with tracking.start(settings, data) as logger:
@@ -150,8 +134,65 @@ def test_a_signal_within_a_transaction_of_the_store_leaves_no_run_that_says_runn
             write()
     finally:
         event.remove(Engine, "after_cursor_execute", interrupt)
+    assert len(sent) == 1  # written, and not a second time as the run ended
+    (run,) = tracking.runs()
+    assert run.info.status == "KILLED"
+    assert run.data.params["seed"] == "0"
+    assert run.inputs is not None
+    assert len(run.inputs.dataset_inputs) == 1
+    assert run.data.metrics == ({"train/loss": 0.5} if table == "metrics" else {})
+
+
+def test_a_signal_does_not_break_off_the_making_of_the_store(store_folder: Path) -> None:
+    """Half of the tables would be left, and every later command refused."""
+    sent: list[str] = []
+
+    def interrupt(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
+        if statement.lstrip().startswith("ALTER TABLE") and not sent:
+            sent.append(statement)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    event.listen(Engine, "after_cursor_execute", interrupt)
+    try:
+        with raising_signals(), pytest.raises(signals.Interrupted, match="SIGINT"):
+            tracking.client()
+    finally:
+        event.remove(Engine, "after_cursor_execute", interrupt)
     assert sent
-    assert [run.info.status for run in tracking.runs()] == ["KILLED"]
+    assert tracking.runs() == []
+
+
+def test_a_server_that_does_not_answer_keeps_no_signal_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
+
+    def write() -> None:
+        with tracking.whole():
+            os.kill(os.getpid(), signal.SIGINT)
+            pytest.fail("it waited")
+
+    with raising_signals(), pytest.raises(signals.Interrupted):
+        write()
+
+
+def test_a_signal_that_is_sent_on_again_is_one_request(store_folder: Path) -> None:
+    """As of `timeout`, which tells make and its processes; a second Ctrl-C, later, is another."""
+    with raising_signals():
+        with pytest.raises(signals.Interrupted, match="SIGTERM"):
+            os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(signals.REPEATED + 0.05)
+        with pytest.raises(signals.Interrupted, match="SIGTERM"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_what_nohup_ignores_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with raising_signals():
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signals.arrived() is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 class Deaf:

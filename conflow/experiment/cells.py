@@ -31,6 +31,8 @@ METHODS = {
     "few_steps": "few solver steps",
     "plus": "plus: the best together",
 }
+BASELINE = "no model: "
+"""Begins the rows of the sources and of the demonstrations."""
 SOURCES = ("cgp", "gaussian", "gp", "spectral", "fitted", "plus")
 """The ablations whose sources differ."""
 COLLISIONS = {
@@ -104,6 +106,11 @@ class Cell:
     paper_p: float | None
 
     @property
+    def without_model(self) -> bool:
+        """Whether this is of a source or of demonstrations."""
+        return self.row.startswith(BASELINE)
+
+    @property
     def differs(self) -> bool:
         """Whether this is another rate than the paper's."""
         return self.paper_p is not None and self.paper_p < LEVEL
@@ -173,7 +180,7 @@ def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, li
                 baseline = metric.replace("test/none/", f"without_model/{group}/")
                 # The same demonstrations for every run, so they are counted once.
                 chosen = of_row if group == "source" else [run for run in every if _measured(baseline, [run])][:1]
-                cells.append(cell(table, f"no model: {row}", column, None, baseline, chosen))
+                cells.append(cell(table, f"{BASELINE}{row}", column, None, baseline, chosen))
     return cells
 
 

@@ -77,7 +77,8 @@ def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> N
     with ProgressDisplay(console) as display:
         evaluation = evaluate(model, data.test, display)
     logger = tracking.RunLogger(tracking.client(), run.info.run_id)
-    logger.log_metrics(evaluation.keyed(f"evaluate/{label}/", baseline=False), 0)
-    logger.save()
-    logger.store.log_dict(run.info.run_id, model.config.tree(), f"evaluate/{label}.yaml")
+    with tracking.whole():
+        logger.store.log_dict(run.info.run_id, model.config.tree(), f"evaluate/{label}.yaml")
+        logger.log_metrics(evaluation.keyed(f"evaluate/{label}/", baseline=False), 0)
+        logger.save()
     console.print(report.results_table(evaluation.results, f"{run.info.run_name}, {label}"))

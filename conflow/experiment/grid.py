@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from rich.console import Console
 
-from conflow.experiment import config, resume, tracking
+from conflow.experiment import config, resume, signals, tracking
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.progress import ProgressDisplay
@@ -25,13 +25,13 @@ STEPS = re.compile(r"^(training|sampling) (\d+)/(\d+)")
 
 @dataclass
 class Cell:
-    """One experiment of the grid: the arguments that ask for it, and how far it is."""
+    """One experiment of the grid: the arguments that ask for it, how far it is, and whether it failed to end well."""
 
     arguments: list[str]
     config: Config
     share: float = 0.0
     note: str = ""
-    failed: bool = False
+    failed: bool = True
     output: list[str] = field(default_factory=list)
 
     @property
@@ -96,14 +96,24 @@ def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
                 busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
                 display.update(task, math.floor(10 * sum(cell.share for cell in cells)) / 10, busy)
         except BaseException:
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    waiting.get_nowait()
-            for process in list(processes):
-                process.terminate()  # each marks its own run KILLED
-            for thread in threads:
-                thread.join()
+            with signals.held():
+                _stop(waiting, processes, threads)
             raise
+
+
+def _stop(
+    waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], threads: Sequence[threading.Thread]
+) -> None:
+    """Begin no other cell, and end those that train: each marks its own run KILLED."""
+    with contextlib.suppress(queue.Empty):
+        while True:
+            waiting.get_nowait()
+    told: set[subprocess.Popen[str]] = set()
+    while any(thread.is_alive() for thread in threads):
+        for process in set(processes) - told:  # also one that was only being started
+            process.terminate()
+            told.add(process)
+        time.sleep(0.1)
 
 
 def _work(waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], jobs: int) -> None:

@@ -123,11 +123,11 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
         (cell.row, one.preset): cell
         for one in comparisons
         for cell in one.cells
-        if (cell.table, cell.column) == ("1", none) and cell.row in METHODS.values()
+        if (cell.table, cell.column) == ("1", none) and not cell.without_model
     }
     presets = list(dict.fromkeys(preset for _, preset in cells))
     rows = []
-    for method in METHODS.values():
+    for method in dict.fromkeys([*METHODS.values(), *(row for row, _ in cells)]):
         of_row = [cells.get((method, preset)) for preset in presets]
         if any(of_row):
             paper = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")

@@ -4,12 +4,13 @@ import logging
 import os
 import platform
 import re
+import shutil
 import socket
 import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,8 @@ def client() -> MlflowClient:
     local = store_uri() == local_uri()
     # A server decides itself where artifacts go.
     artifacts = None if store_uri().startswith("http") else (RUNS / "artifacts").absolute().as_uri()
-    # Two processes that migrate a new SQLite file at once break it.
-    with FileLock(RUNS / ".store.lock"):
+    # Two processes that migrate a new SQLite file at once break it, and so does one that is interrupted.
+    with FileLock(RUNS / ".store.lock"), whole():
         store = MlflowClient(store_uri())
         experiment = store.get_experiment_by_name(EXPERIMENT)
         if experiment is None:
@@ -93,6 +94,14 @@ def runs(status: str | None = None, **tags: str) -> list[Run]:
 def checkpoints(run_id: str) -> Path:
     """Where the state of a run's training is kept."""
     return RUNS / "checkpoints" / run_id
+
+
+def whole() -> AbstractContextManager[None]:
+    """Holds signals in the block: a write that one broke off would leave a transaction open, and the database locked.
+
+    A server ends its transactions itself, and one that does not answer must not keep Ctrl-C waiting.
+    """
+    return nullcontext() if store_uri().startswith("http") else held()
 
 
 def _check_reachable(uri: str) -> None:
@@ -163,8 +172,6 @@ def artifact(run: Run, name: str) -> Path:
 class RunLogger(MLFlowLogger):
     """Lightning's MLflow logger, except that metrics are written in batches and the run's status is left alone.
 
-    No signal interrupts a write: it would leave a transaction open, and so the store locked for the run's own end.
-
     Args:
         store: where the run is.
         run_id: the run.
@@ -194,18 +201,18 @@ class RunLogger(MLFlowLogger):
     def log_hyperparams(self, *_: Any, **__: Any) -> None:
         """`start` has logged the whole config."""
 
-    @held()
     def save(self) -> None:
         """Write what is buffered."""
-        for i in range(0, len(self.buffer), 1000):
-            self.store.log_batch(str(self.run_id), metrics=self.buffer[i : i + 1000])
-        self.buffer.clear()
-        self.flushed = time.monotonic()
+        with whole():
+            for i in range(0, len(self.buffer), 1000):
+                self.store.log_batch(str(self.run_id), metrics=self.buffer[i : i + 1000])
+            self.buffer.clear()
+            self.flushed = time.monotonic()
 
-    @held()
     def log_files(self, folder: str) -> None:
         """Make everything in a folder an artifact of the run."""
-        self.store.log_artifacts(str(self.run_id), folder)
+        with whole():
+            self.store.log_artifacts(str(self.run_id), folder)
 
     def finalize(self, status: str = "success") -> None:
         self.save()
@@ -235,7 +242,8 @@ def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -
             with held():
                 run_id = _create(store, config, data, lock) if resumed is None else _reopen(store, resumed, lock)
                 logger = RunLogger(store, run_id, again=resumed is not None)
-            _describe(store, run_id, config, data)
+            with whole():
+                _describe(store, run_id, config, data)
             yield logger
             signals.check()
         except BaseException:
@@ -267,7 +275,6 @@ def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
     return run_id
 
 
-@held()
 def _describe(store: MlflowClient, run_id: str, config: Config, data: DemonstrationData) -> None:
     store.log_batch(run_id, params=[Param(key, str(value)) for key, value in flatten(config.tree()).items()])
     store.log_dict(run_id, config.tree(), CONFIG_FILE)
@@ -275,10 +282,13 @@ def _describe(store: MlflowClient, run_id: str, config: Config, data: Demonstrat
 
 
 def _end(logger: RunLogger, status: str) -> None:
-    with held():
+    run_id = str(logger.run_id)
+    with whole():
         try:
             logger.save()
-            logger.store.set_terminated(str(logger.run_id), status)
+            logger.store.set_terminated(run_id, status)
+            if status == "FINISHED":  # what such a run needs is among its artifacts
+                shutil.rmtree(checkpoints(run_id), ignore_errors=True)
         except Exception:
             # What ended the run is what its user must hear of; a later command marks it.
             if status == "FINISHED":

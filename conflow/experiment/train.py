@@ -1,7 +1,6 @@
 """One experiment from its config to a finished MLflow run."""
 
 import logging
-import shutil
 import tempfile
 import warnings
 from pathlib import Path
@@ -68,7 +67,6 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
             }
             figures.save(pictures, Path(folder, "figures"))
             logger.log_files(folder)
-    shutil.rmtree(tracking.checkpoints(run_id))  # what a finished run needs is among its artifacts
     title = f"{config.ablation}-s{config.seed}, preset {config.preset}"
     console.print(report.results_table(evaluation.results, title))
     return run_id

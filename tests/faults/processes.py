@@ -15,6 +15,8 @@ import torch
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
+from conflow.experiment.signals import SIGNALS
+
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["conflow.experiment.train", "conflow.experiment.grid", "tests.faults.processes"])
 
@@ -24,7 +26,7 @@ Death = Callable[[], None]
 
 def start(folder: Path, *arguments: str, death: Death | None = None) -> Any:
     """A process that runs the command line in a folder, its output in the file `output` there."""
-    process = CONTEXT.Process(target=_main, args=(folder, arguments, death))
+    process = CONTEXT.Process(target=_main, args=(folder, arguments, death), daemon=True)  # ends with a test that fails
     process.start()
     return process
 
@@ -43,6 +45,8 @@ def run(folder: Path, *arguments: str, death: Death | None = None, seconds: floa
 def _main(folder: Path, arguments: tuple[str, ...], death: Death | None) -> None:
     from conflow.__main__ import main
 
+    for signum in SIGNALS:
+        signal.signal(signum, signal.default_int_handler)  # whatever the tests' own process ignores
     os.chdir(folder)
     os.environ.pop("MLFLOW_TRACKING_URI", None)
     output = os.open("output", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)

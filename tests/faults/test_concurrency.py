@@ -100,7 +100,7 @@ for seed in range(5):
 
 def make_together(folders: Sequence[Path], experiment: str, uri: str | None = None) -> None:
     """A process in each folder makes the same experiment, then five data sets, at the same moment as the others."""
-    command = ["timeout", "200", sys.executable, "-c", MAKE, experiment, *TINY]
+    command = ["timeout", "400", sys.executable, "-c", MAKE, experiment, *TINY]
     processes: list[subprocess.Popen[str]] = []
     for folder in folders:
         with (folder / f"errors {len(processes)}").open("w") as errors:
@@ -164,7 +164,8 @@ def test_a_grid_finishes_while_the_pages_are_open_and_they_answer_throughout(tmp
     page = f"http://127.0.0.1:{port}"
     with (tmp_path / "ui.log").open("w") as log:  # a pipe that nobody reads would fill and stop the server
         ui = started(tmp_path, "ui", f"port={port}", output=log)
-    grid = started(tmp_path, "ablations", *TINY, "seeds=0", "ablations=cgp fm")
+    longer = [TINY[0], "train.max_steps=500", *TINY[2:]]  # long enough to be looked at
+    grid = started(tmp_path, "ablations", *longer, "seeds=0", "ablations=cgp fm")
     seen = set()
     with stopped_afterwards(ui, grid):
         wait_for(page, ui)

@@ -24,7 +24,8 @@ def statuses(folder: Path) -> list[tuple[str, str]]:
 
 
 def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    stopped = processes.start(tmp_path, *GRID)
+    longer = (*GRID, "train.max_steps=2000", "train.val_every=1000")
+    stopped = processes.start(tmp_path, *longer)
     deadline = time.monotonic() + 180
     # The grid has made the store when it says this; to look at it earlier would race with its migration.
     output = tmp_path / "output"
@@ -34,10 +35,10 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
     while len(statuses(tmp_path)) < 2 and time.monotonic() < deadline:
         time.sleep(0.3)
     os.kill(stopped.pid, signal.SIGINT)
-    stopped.join(60)
+    stopped.join(180)
     assert stopped.exitcode == 128 + signal.SIGINT, output.read_text()
     assert statuses(tmp_path) == [("cgp-s0", "FINISHED"), ("fm-s0", "KILLED")]
-    code, said = processes.run(tmp_path, *GRID)
+    code, said = processes.run(tmp_path, *longer)
     assert code == 0, said
     assert "2 cells, 1 of them finished before" in said
     assert "Table 1" in said

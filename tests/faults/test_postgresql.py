@@ -185,7 +185,7 @@ def test_a_training_interrupted_on_a_server_is_killed_there(server: Server, tmp_
                 break
             time.sleep(0.5)
         training.send_signal(signal.SIGTERM)
-        output, _ = training.communicate(timeout=60)
+        output, _ = training.communicate(timeout=180)
     assert training.returncode == 128 + signal.SIGTERM, output
     assert output.splitlines()[-1] == "conflow: interrupted by SIGTERM"
     (run,) = server.runs("cgp-s5")

@@ -44,7 +44,7 @@ def test_an_interrupted_run_is_killed_exits_with_the_signal_and_keeps_what_was_l
     process = processes.start(folder, *ENDLESS, f"seed={50 + signum}")
     wait_for_metrics(folder, name)
     os.kill(process.pid, signum)
-    process.join(60)
+    process.join(180)
     assert process.exitcode == 128 + signum
     assert (folder / "output").read_text().splitlines()[-1] == f"conflow: interrupted by {signum.name}"
     assert status(folder, name) == "KILLED"

@@ -6,7 +6,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from conflow.experiment.cells import GUARDS, METHODS, Cell
+from conflow.experiment.cells import GUARDS, Cell
 from conflow.experiment.compare import Comparison
 
 RATE, DISTANCE, *_ = GUARDS.values()
@@ -62,9 +62,9 @@ def front(comparisons: Sequence[Comparison]) -> Figure:
 def _points(comparisons: Sequence[Comparison]) -> dict[str, dict[str, tuple[Cell, Cell]]]:
     """By method and preset the cells of the energy distance and of the rate, where there are both."""
     found: dict[str, dict[str, tuple[Cell, Cell]]] = {}
-    for method in METHODS.values():
-        for one in comparisons:
-            cells = {cell.column: cell for cell in one.cells if (cell.table, cell.row) == ("3", method)}
-            if DISTANCE in cells and RATE in cells:
-                found.setdefault(method, {})[one.preset] = (cells[DISTANCE], cells[RATE])
+    for one in comparisons:
+        cells = {(cell.row, cell.column): cell for cell in one.cells if cell.table == "3" and not cell.without_model}
+        for method in dict.fromkeys(row for row, _ in cells):
+            if {(method, DISTANCE), (method, RATE)} <= cells.keys():
+                found.setdefault(method, {})[one.preset] = (cells[method, DISTANCE], cells[method, RATE])
     return found

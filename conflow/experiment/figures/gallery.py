@@ -24,6 +24,8 @@ from conflow.experiment.record import Record
 NUM = 512
 TIMES = (0.3, 0.6, 0.9)
 """At which `taken_back` is drawn."""
+LONGEST = 200
+"""Characters of a folder's name; systems allow 255 bytes."""
 COMPARED = 0.6
 """The one of them at which several runs are compared."""
 
@@ -58,9 +60,13 @@ def draw_front(console: Console) -> None:
 
 
 def _title(run: Run) -> str:
-    """A run's preset and name, and what sets it apart from its ablation."""
+    """A run's preset and name, and what sets it apart from its ablation, if that is known still."""
     one = Record.of(run)
-    return " ".join([f"{one.preset}/{run.info.run_name}", *one.changes])
+    try:
+        changes = one.changes
+    except ConfigError:
+        changes = []
+    return " ".join([f"{one.preset}/{run.info.run_name}", *changes])
 
 
 def _collisions(title: str, model: ConFlow, evaluation: Evaluation) -> str:
@@ -79,7 +85,7 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
     data = demonstrations(run, model.config)
     name = str(run.info.run_name)
     # A name given in MLflow's pages may hold anything, also a way out of the folder.
-    folder = _folder() / re.sub(r"[^\w.=-]+", "_", _title(run))
+    folder = _folder() / re.sub(r"[^\w.=-]+", "_", _title(run))[:LONGEST]
     console.print(f"{name}: {NUM} trajectories under each setting", highlight=False)
     evaluation = sample(model, data)
     x_0, x_1 = evaluation.source_samples, cycle(data.test.x, NUM)
