@@ -69,7 +69,7 @@ def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Fig
 
 def taken_back(shares: Sequence[tuple[str, Tensor]]) -> Figure:
     """How much of a push along grad C the velocity takes back in each mode of the source, a line for each name."""
-    figure = Figure(figsize=(7.2, 5.4), layout="constrained")
+    figure = Figure(figsize=(8.6, 5.4), layout="constrained")
     axis = figure.subplots()
     for name, share in shares:
         axis.plot(range(1, 1 + len(share[:MODES])), share[:MODES], marker="o", ms=4, label=name)

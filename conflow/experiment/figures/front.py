@@ -6,10 +6,12 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from conflow.experiment.cells import GUARDS, Cell
+from conflow.experiment.cells import GUARDS, METHODS, Cell
 from conflow.experiment.compare import Comparison
 
 RATE, DISTANCE, *_ = GUARDS.values()
+SHORT = {method: ablation for ablation, method in METHODS.items()}
+"""A method by its ablation: the names of the tables would cover each other."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255")
 MARKERS = "osD^vP*X<>pdh8"
 
@@ -40,7 +42,14 @@ def front(comparisons: Sequence[Comparison]) -> Figure:
         # Where it collides least; neighbours in the list are often neighbours here.
         distance, rate = min(points.values(), key=lambda point: point[1].value)
         place = (6, 3 if i % 2 else -10)
-        axis.annotate(method, (distance.value, rate.value), place, textcoords="offset points", fontsize=8, color=colour)
+        axis.annotate(
+            SHORT.get(method, method),
+            (distance.value, rate.value),
+            place,
+            textcoords="offset points",
+            fontsize=8,
+            color=colour,
+        )
     axis.set_xscale("symlog", linthresh=0.01)
     axis.set_yscale("symlog", linthresh=1e-3)
     axis.axvline(0, color="#666666", lw=0.8)
