@@ -174,7 +174,7 @@ def test_a_server_that_does_not_answer_keeps_no_signal_waiting(monkeypatch: pyte
         write()
 
 
-def test_a_signal_that_is_sent_on_again_is_one_request(store_folder: Path) -> None:
+def test_a_signal_that_is_sent_on_again_is_one_request() -> None:
     """As of `timeout`, which tells make and its processes; a second Ctrl-C, later, is another."""
     with raising_signals():
         with pytest.raises(signals.Interrupted, match="SIGTERM"):

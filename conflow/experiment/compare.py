@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from conflow.experiment import config, paper, record
-from conflow.experiment.cells import COLLISIONS, METHODS, Cell, labels, tables
+from conflow.experiment.cells import BASELINE, COLLISIONS, METHODS, Cell, labels, tables
 from conflow.experiment.claims import Claim, claims
 from conflow.experiment.config import ConfigError
 from conflow.experiment.record import Record
@@ -111,7 +111,7 @@ def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Reco
     found = {name: _command(of_row) for name, of_row in readings.items()}
     for ablation, of_row in runs.items():
         name, again = METHODS.get(ablation, ablation), _command(of_row)
-        found |= {name: again, f"no model: source {ablation}": again}
+        found |= {name: again, f"{BASELINE}source {ablation}": again}
         seeds = " ".join(str(one.seed) for one in of_row)
         for label in labels(of_row):
             arguments = "" if label == record.UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
@@ -120,7 +120,7 @@ def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Reco
     if "cgp" in runs:
         found["default"] = _command(runs["cgp"])
     for of_row in list(runs.values())[:1]:
-        found |= dict.fromkeys(("no model: test data", "no model: feasible test data"), _command(of_row[:1]))
+        found |= dict.fromkeys((f"{BASELINE}test data", f"{BASELINE}feasible test data"), _command(of_row[:1]))
     return found
 
 

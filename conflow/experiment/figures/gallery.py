@@ -24,10 +24,10 @@ from conflow.experiment.record import Record
 NUM = 512
 TIMES = (0.3, 0.6, 0.9)
 """At which `taken_back` is drawn."""
-LONGEST = 200
-"""Characters of a folder's name; systems allow 255 bytes."""
 COMPARED = 0.6
 """The one of them at which several runs are compared."""
+LONGEST = 200
+"""Characters of a folder's name; systems allow 255 bytes."""
 
 
 def draw(wanted: Sequence[str], console: Console) -> None:
