@@ -190,3 +190,34 @@ class ObstacleAvoidance(Avoidance):
         offset = torch.tensor([[o.x, o.y] for o in obstacles]).repeat(robots.count, 1)
         radius = torch.tensor([robot_radius + o.radius for o in obstacles]).repeat(robots.count)
         super().__init__(robots, incidence, offset, radius, barrier or Barrier())
+
+
+class Workspace(Constraint):
+    """Every robot's position stays in [-1, 1]^2, and `margin` away from its walls: c = 1 - margin - |p|.
+
+    Each wall counts for itself, at every waypoint: a robot in a corner is pushed away from both.
+    """
+
+    def __init__(self, robots: PointRobots, margin: float = 0.0, barrier: Barrier | None = None) -> None:
+        super().__init__()
+        self.robots, self.margin, self.shape = robots, margin, barrier or Barrier()
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return self._walls(x)[1].amin(dim=2)
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        # A square is convex, so between two points inside nothing is nearer to a wall than one of them.
+        c = self.clearance(x)
+        return torch.minimum(c[:, :-1], c[:, 1:])
+
+    def barrier(self, x: Tensor) -> Tensor:
+        return self.shape.value(self._walls(x)[1]).sum(dim=(1, 2))
+
+    def gradient(self, x: Tensor) -> Tensor:
+        p, c = self._walls(x)
+        return self.robots.pullback((-p.sign() * self.shape.slope(c)).unflatten(2, (-1, 2)))
+
+    def _walls(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Coordinates p of all body points and their clearances, both (batch, T, 2 bodies)."""
+        p = self.robots.points(x).flatten(2)
+        return p, 1 - self.margin - p.abs()
