@@ -27,7 +27,7 @@ from conflow.experiment.build import obstacle_avoidance, random_stream
 from conflow.experiment.config import ConfigError, Range, brief, check_memory, nearest
 from conflow.experiment.figures.workspace import COLLISION, OBSTACLE, ROBOTS
 from conflow.experiment.finished import MODEL_FILE, load_model
-from conflow.experiment.metrics import smoothness, wilson
+from conflow.experiment.metrics import leaves_workspace, smoothness, wilson
 from conflow.experiment.module import ConFlow, start_and_goal
 from conflow.experiment.tracking import artifact, find_run
 from conflow.flow.correction import Correction
@@ -50,8 +50,9 @@ class Plans:
 
     Attributes:
         x: (B, num, T, D) in workspace units, or (num, T, D) for a single pair; likewise below.
-        clearance: smallest clearance over waypoints, robots and the obstacles given, (B, num).
-        feasible: no waypoint is in collision, boolean (B, num).
+        clearance: the smallest on the way, straight from waypoint to waypoint, over robots and the obstacles given,
+            (B, num).
+        feasible: there is no collision on the way, and all of it is inside the workspace; boolean (B, num).
         smoothness: mean norm of the second difference of the robots' positions, (B, num); smaller is smoother.
     """
 
@@ -182,14 +183,15 @@ class Planner:
         sample = self.model.config.sample
         lambda_r = _weight("robot_weight", robot_weight, sample.robot_weight)
         lambda_o = _weight("obstacle_weight", obstacle_weight, sample.obstacle_weight)
-        v = self.model.field("none", ends)
+        weighted = []
         if guidance in ("robot", "both"):
-            v = self.model.guided(v, self.model.u_c, lambda_r)
+            weighted.append((self.model.u_c, lambda_r))
         if guidance in ("obstacle", "both") and obstacles:
             # Guided as in training, with its margin; judged without.
             near = Sum([self._avoidance(disc, self.model.config.correction.margin) for disc in obstacles])
-            v = self.model.guided(v, Correction(near, self.model.u_c.smoothing), lambda_o)
-        return v
+            weighted.append((Correction(near, self.model.u_c.smoothing), lambda_o))
+        v = self.model.field("none", ends)
+        return self.model.guided(v, *weighted) if weighted else v
 
     def _avoidance(self, disc: Obstacle, margin: float = 0.0) -> Constraint:
         """The run's constraint, with its barrier, for another obstacle."""
@@ -224,8 +226,8 @@ def exact(source: Source, x: Tensor, y: Tensor) -> Tensor:
 def _ranked(x: Tensor, constraint: Constraint) -> Plans:
     """Trajectories x (B, num, T, D) judged and sorted."""
     flat, pairs = x.flatten(0, 1), x.shape[:2]
-    clearance = constraint.clearance(flat).amin(dim=1).view(pairs)
-    feasible = ~constraint.violation(flat).view(pairs)
+    clearance = constraint.swept_clearance(flat).amin(dim=1).view(pairs)
+    feasible = (clearance >= 0) & ~leaves_workspace(flat).view(pairs)
     smooth = smoothness(flat).view(pairs)
     order = smooth.argsort(dim=1, stable=True)
     order = order.gather(1, feasible.gather(1, order).argsort(dim=1, descending=True, stable=True))

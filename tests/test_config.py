@@ -23,6 +23,7 @@ CHANGES = {
         "correction.lambda_c",
         "correction.margin",
         "data.negative_share",
+        "sample.guidance",
     },
     "few_steps": {"sample.solver", "sample.steps"},
 }

@@ -230,9 +230,9 @@ def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: 
 
 
 @pytest.mark.parametrize("t", [0.0, 0.5, 1.0])
-def test_guidance_of_plus_acts_where_its_training_does(t: float) -> None:
+def test_guidance_at_the_end_acts_where_its_training_does(t: float) -> None:
     """v + lambda t u^c(x + (1 - t) v): nothing at t = 0, the plain guidance at t = 1."""
-    flow = model("ablation=plus", "source.fit=false")
+    flow = model("ablation=plus", "source.fit=false", "sample.guidance=end")
     torch.nn.init.normal_(flow.v.outlet.weight, std=0.1)  # so that the predicted end is elsewhere than x
     x, times = swap(50), torch.full((50,), t)
     v, weight = flow.v(x, times), flow.config.sample.robot_weight

@@ -1,6 +1,7 @@
 """Integration of the field against closed forms and torchdiffeq, and guidance without autograd."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NoReturn, get_args
 
 import pytest
@@ -10,7 +11,8 @@ from torchdiffeq import odeint
 
 from conflow.flow.correction import Correction, gaussian_filter
 from conflow.flow.network import ResMLP
-from conflow.flow.sampler import Field, Solver, guided, integrate, states
+from conflow.flow.path import end
+from conflow.flow.sampler import Field, Solver, descended, guided, guided_ahead, integrate, states
 from conflow.scene.constraint import RobotAvoidance
 from conflow.scene.robots import PointRobots
 
@@ -107,10 +109,57 @@ def test_sampling_leaves_its_start_alone(solver: Solver) -> None:
 
 
 def test_guidance_adds_the_weighted_correction() -> None:
-    """guided(v, u, lambda) is v + lambda u, and v itself for weight 0."""
+    """guided(v, lambda u) is v + lambda u, and v itself for weight 0."""
     x, t = initial(), torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
-    torch.testing.assert_close(guided(bernoulli, torch.sin, 0.7)(x, t), bernoulli(x, t) + 0.7 * torch.sin(x))
-    assert torch.equal(guided(bernoulli, torch.sin, 0.0)(x, t), bernoulli(x, t))
+    torch.testing.assert_close(guided(bernoulli, weighted(0.7))(x, t), bernoulli(x, t) + 0.7 * torch.sin(x))
+    assert torch.equal(guided(bernoulli, weighted(0.0))(x, t), bernoulli(x, t))
+
+
+def weighted(weight: float) -> Callable[[Tensor], Tensor]:
+    """lambda sin(x) as a push."""
+    return lambda x: weight * torch.sin(x)
+
+
+def test_guidance_ahead_pushes_at_the_predicted_end() -> None:
+    x, t = initial(), torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
+    v, s = bernoulli(x, t), t[:, None, None]
+    torch.testing.assert_close(guided_ahead(bernoulli, weighted(0.7))(x, t), v + s * 0.7 * torch.sin(x + (1 - s) * v))
+
+
+@pytest.mark.parametrize("t", [0.3, 0.5, 0.99])
+def test_descent_leads_straight_to_the_descended_end(t: float) -> None:
+    """Whoever follows the field of one moment to t = 1 arrives at e after the steps of descent."""
+    x, now = initial(), torch.full((3,), t, dtype=torch.float64)
+    e = end(x, bernoulli(x, now), now)
+    for _ in range(4):
+        e = e + 0.7 * torch.sin(e)
+    torch.testing.assert_close(end(x, descended(bernoulli, weighted(0.7))(x, now), now), e)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.29, 1.0])
+def test_descent_leaves_the_field_alone_where_there_is_nothing_to_predict(t: float) -> None:
+    """Early on the end is the mean of too much; at t = 1 no time is left, and rk4 asks for the field there."""
+    x, now = initial(), torch.full((3,), t, dtype=torch.float64)
+    assert torch.equal(descended(bernoulli, weighted(0.7))(x, now), bernoulli(x, now))
+
+
+@pytest.mark.parametrize("steps", [10, 250])
+def test_one_euler_step_from_the_end_descent_puts_right_what_a_push_cannot(steps: int) -> None:
+    """A flow straight to x_1 = 0, where x_1 >= 1 is asked for: descent keeps it, with few steps and with many.
+
+    A push lambda (1 - x)_+ per unit of time ends at (1 - 0) lambda / (1 + lambda) of the way or worse.
+    """
+
+    def towards_zero(x: Tensor, t: Tensor) -> Tensor:
+        return -x / (1 - t[:, None, None])
+
+    def short(x: Tensor) -> Tensor:
+        return 0.5 * (1 - x).clamp_min(0)
+
+    x_0 = initial()
+    # Each of four half steps leaves half of what is missing.
+    assert bool((integrate(descended(towards_zero, short), x_0, steps) >= 1 - 2**-4 - 1e-9).all())
+    assert bool((integrate(guided(towards_zero, short), x_0, steps) < 0.5).all())
 
 
 @solvers
@@ -127,11 +176,11 @@ def test_sampling_needs_no_autograd(solver: Solver, monkeypatch: pytest.MonkeyPa
     v = ResMLP(8, 4, hidden=16, blocks=1)
     correction = Correction(RobotAvoidance(PointRobots(2)), gaussian_filter(8))
     x_0 = initial(torch.float32)
-    free, pushed = integrate(v, x_0, 5, solver), integrate(guided(v, correction, 1.0), x_0, 5, solver)
+    free, pushed = integrate(v, x_0, 5, solver), integrate(guided(v, correction), x_0, 5, solver)
     assert not pushed.requires_grad
     assert not torch.equal(pushed, free)
     with torch.inference_mode():
-        assert torch.equal(integrate(guided(v, correction, 1.0), x_0, 5, solver), pushed)
+        assert torch.equal(integrate(guided(v, correction), x_0, 5, solver), pushed)
     assert torch.is_grad_enabled()
 
 

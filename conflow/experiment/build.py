@@ -12,7 +12,7 @@ from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
 from conflow.flow.network import ResMLP, SpectralMLP
 from conflow.flow.source import Source
-from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance
+from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance, Sum, Workspace
 from conflow.scene.robots import PointRobots
 
 
@@ -49,6 +49,14 @@ def judge(settings: Config, D: int) -> Constraint:
 def robot_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:
     """The constraint that labels, corrects and guides: robots keep their distance, and a margin."""
     return RobotAvoidance(PointRobots(D // 2), settings.constraint.radius + margin, _barrier(settings.constraint))
+
+
+def kept(settings: Config, D: int) -> Constraint:
+    """What training corrects for and guidance keeps: the robots' distance and, where asked for, the walls."""
+    margin, robots = settings.correction.margin, robot_avoidance(settings, D, settings.correction.margin)
+    if not settings.correction.walls:
+        return robots
+    return Sum([robots, Workspace(PointRobots(D // 2), margin, _barrier(settings.constraint))])
 
 
 def obstacle_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:

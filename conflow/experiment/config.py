@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from conflow.flow.correction import Edges
-from conflow.flow.sampler import Solver
+from conflow.flow.sampler import Guidance, Solver
 from conflow.scene.constraint import BarrierShape, Obstacle, Reduction
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -113,6 +113,7 @@ class Correction:
     at: Place
     path: PathKind
     margin: Annotated[float, Range(0, 1)]
+    walls: bool
     smoothing: Smoothing
     sigma: Scale
     width: Annotated[int, Range(1, 8191)]
@@ -144,6 +145,7 @@ class Sample:
     num: Annotated[int, Range(2, 10**9)]
     solver: Solver
     steps: Count
+    guidance: Guidance
     robot_weight: Weight
     obstacle_weight: Weight
     obstacle: Obstacle

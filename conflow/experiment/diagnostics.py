@@ -107,7 +107,7 @@ def collisions_by_weight(
     """How many of the trajectories from x_0 (batch, T, D) hit what the setting avoids, at each guidance weight."""
     sample = model.config.sample
     u_c = model.u_c_obstacle if setting == "obstacle" else model.u_c
-    fields = [model.guided(model.field("none", ends), u_c, weight) for weight in weights]
+    fields = [model.guided(model.field("none", ends), (u_c, weight)) for weight in weights]
     return [
         int(avoided(model, setting).violation(integrate(field, x_0, sample.steps, sample.solver)).sum())
         for field in fields

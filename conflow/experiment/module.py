@@ -15,6 +15,7 @@ from conflow.experiment.build import (
     build_source,
     correction,
     judge,
+    kept,
     network,
     obstacle_avoidance,
     random_stream,
@@ -24,7 +25,7 @@ from conflow.experiment.config import Config, ConfigError
 from conflow.flow.correction import Correction
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import end, guided_path, interpolate, velocity
-from conflow.flow.sampler import Field, guided, guided_ahead, integrate
+from conflow.flow.sampler import GUIDANCE, Field, integrate
 
 Setting = Literal["none", "robot", "obstacle"]
 SETTINGS: tuple[Setting, ...] = get_args(Setting)
@@ -50,7 +51,7 @@ class ConFlow(LightningModule):
         self.robots, self.obstacle = judge(config, D), obstacle_avoidance(config, D)
         self.v = network(config.network, self.source, D, robot_avoidance(config, D))
         margin = config.correction.margin
-        self.u_c = correction(config.correction, robot_avoidance(config, D, margin), self.source)
+        self.u_c = correction(config.correction, kept(config, D), self.source)
         self.u_c_obstacle = correction(config.correction, obstacle_avoidance(config, D, margin), self.source)
         self.grad_norm = torch.zeros(())
 
@@ -91,15 +92,21 @@ class ConFlow(LightningModule):
     def field(self, setting: Setting, ends: Tensor | None = None) -> Field:
         """The velocity field of a setting, for starts and goals (batch, 2, D) where the network sees them."""
         sample, v = self.config.sample, partial(self.v, ends=ends)
+        robots, obstacle = (self.u_c, sample.robot_weight), (self.u_c_obstacle, sample.obstacle_weight)
+        if setting == "none":
+            return v
         if setting == "robot":
-            return self.guided(v, self.u_c, sample.robot_weight)
-        if setting == "obstacle":
-            return self.guided(v, self.u_c_obstacle, sample.obstacle_weight)
-        return v
+            return self.guided(v, robots)
+        # What descent moves it puts somewhere for good, so there it has to keep everything at once.
+        return self.guided(v, robots, obstacle) if sample.guidance == "descent" else self.guided(v, obstacle)
 
-    def guided(self, v: Field, u_c: Correction, weight: float) -> Field:
-        """A field guided by a correction, taken where the training takes it."""
-        return (guided_ahead if self.config.correction.at == "end" else guided)(v, u_c, weight)
+    def guided(self, v: Field, *weighted: tuple[Correction, float]) -> Field:
+        """A field guided by corrections u^c with their weights lambda, in the way that `sample.guidance` says."""
+
+        def push(x: Tensor) -> Tensor:
+            return torch.stack([weight * u_c(x) for u_c, weight in weighted]).sum(dim=0)
+
+        return GUIDANCE[self.config.sample.guidance](v, push)
 
     def sample(self, x_1: Tensor, setting: Setting = "none", noise: torch.Generator | None = None) -> Tensor:
         """Trajectories from where each x_1 starts to where it ends, both (batch, T, D)."""

@@ -15,16 +15,22 @@ Field = Callable[[Tensor, Tensor], Tensor]
 Solver = Literal["euler", "midpoint", "rk4"]
 
 
-def guided(v: Field, correction: Callable[[Tensor], Tensor], weight: float) -> Field:
-    """v(x, t) + lambda u^c(x): the field v, guided by a correction with weight lambda."""
+Push = Callable[[Tensor], Tensor]
+"""lambda u^c: where a trajectory x (batch, T, D) should move, with its weight; of several constraints the sum."""
+
+Guidance = Literal["point", "end", "descent"]
+
+
+def guided(v: Field, push: Push) -> Field:
+    """v(x, t) + lambda u^c(x): the field v, guided where the flow is."""
 
     def field(x: Tensor, t: Tensor) -> Tensor:
-        return v(x, t) + weight * correction(x)
+        return v(x, t) + push(x)
 
     return field
 
 
-def guided_ahead(v: Field, correction: Callable[[Tensor], Tensor], weight: float) -> Field:
+def guided_ahead(v: Field, push: Push) -> Field:
     """v(x, t) + lambda t u^c(x + (1 - t) v(x, t)): guided where the flow is going to end instead of where it is.
 
     What is in collision halfway may be none at t = 1, and needs no guidance. The factor t: the end that is predicted
@@ -33,9 +39,36 @@ def guided_ahead(v: Field, correction: Callable[[Tensor], Tensor], weight: float
 
     def field(x: Tensor, t: Tensor) -> Tensor:
         u = v(x, t)
-        return u + weight * t[:, None, None] * correction(end(x, u, t))
+        return u + t[:, None, None] * push(end(x, u, t))
 
     return field
+
+
+def descended(v: Field, push: Push, steps: int = 4, since: float = 0.3) -> Field:
+    """(e - x) / (1 - t): towards the predicted end e = x + (1 - t) v(x, t) after steps e <- e + lambda u^c(e).
+
+    The steps are of covariant gradient descent on the barrier, with lambda as their length: what is wrong with the end
+    is put right there, whatever time is left. A push of the velocity, which t = 1 cuts short, would have to be the
+    stronger the less time is left, and an explicit solver could not carry it. Before t = `since` the predicted end is
+    the mean of too much, and nothing is done.
+    """
+
+    def field(x: Tensor, t: Tensor) -> Tensor:
+        u = v(x, t)
+        e = predicted = end(x, u, t)
+        for _ in range(steps):
+            e = e + push(e)
+        left = torch.where((t < since) | (t >= 1), torch.inf, 1 - t)
+        return u + (e - predicted) / left[:, None, None]
+
+    return field
+
+
+GUIDANCE: dict[Guidance, Callable[[Field, Push], Field]] = {
+    "point": guided,
+    "end": guided_ahead,
+    "descent": descended,
+}
 
 
 def euler(v: Field, x: Tensor, t: Tensor, h: float) -> Tensor:
