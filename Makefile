@@ -7,6 +7,7 @@ SEEDS    ?= 0 1 2
 ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
 JOBS     ?= 1
 RUN      ?= latest
+KIND     ?= passing
 FORMAT   ?= table
 REFERENCE ?=
 START    ?=
@@ -56,8 +57,8 @@ figures: .venv/installed  ## Draw the pictures of finished runs into runs/figure
 explain: .venv/installed  ## Draw why the covariant correction works, and what fewer collisions cost: PRESET=
 	@$(CONFLOW) explain preset=$(PRESET)
 
-demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": OUT= NUM= SEED=
-	@$(CONFLOW) demonstrations $(WRITTEN) seed=$(SEED)
+demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": KIND=passing|social OUT= NUM= SEED=
+	@$(CONFLOW) demonstrations kind=$(KIND) $(WRITTEN) seed=$(SEED)
 
 bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)
 	@$(CONFLOW) bench format=$(FORMAT) $(if $(REFERENCE),reference=1)

@@ -137,17 +137,23 @@ def explain(arguments: list[str]) -> None:
 
 
 def demonstrations(arguments: list[str]) -> None:
-    """Write demonstrations that bulge where the robots pass, for data.path: out=passing.npz num=3000 seed=0."""
+    """Write demonstrations of another kind, for data.path: kind=passing, or social, out=KIND.npz num=3000 seed=0."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
-    options, _ = config.options(arguments, {"out": "passing.npz", "num": "3000", "seed": "0"}, settings=False)
+    defaults = {"kind": "passing", "out": "", "num": "3000", "seed": "0"}
+    options, _ = config.options(arguments, defaults, settings=False)
     num, seed = config.whole(options, "num", 10, 10**5), config.whole(options, "seed", 0, 2**32 - 1)
 
-    from conflow.scene.trajectories import passing, save
+    from conflow.scene.trajectories import KINDS, save
 
-    save(options["out"], passing(num, seed=seed))
-    print(f"Written: {options['out']}; train on it with: make train ARGS=data.path={options['out']}")
+    kind = options["kind"]
+    if kind not in KINDS:
+        offer = config.nearest(kind, list(KINDS))
+        raise config.ConfigError(f"kind={config.brief(kind)}: expected {' or '.join(KINDS)}{offer}")
+    out = options["out"] or f"{kind}.npz"
+    save(out, KINDS[kind](num, seed=seed))
+    print(f"Written: {out}; train on it with: make train ARGS=data.path={out}")
 
 
 def bench(arguments: list[str]) -> None:

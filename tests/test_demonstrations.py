@@ -226,7 +226,7 @@ def test_the_command_never_overwrites(demonstrations: Run) -> None:
         ("num=9", "num=9: expected a whole number of at least 10 and at most 100000"),
         ("num=many", "num=many: expected a whole number"),
         ("seed=-1", "seed=-1: expected a whole number of at least 0"),
-        ("sed=1", "sed: no such option, expected out, num, seed; did you mean seed?"),
+        ("sed=1", "sed: no such option, expected kind, out, num, seed; did you mean seed?"),
         ("passing.npz", "passing.npz: expected key=value"),
     ],
 )
@@ -241,8 +241,11 @@ def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("demonstrations", "OUT=a b.npz", "NUM=50", "SEED=3"), ["demonstrations", "out=a b.npz", "num=50", "seed=3"]),
-        (("demonstrations",), ["demonstrations", "seed=0"]),
+        (
+            ("demonstrations", "OUT=a b.npz", "NUM=50", "SEED=3"),
+            ["demonstrations", "kind=passing", "out=a b.npz", "num=50", "seed=3"],
+        ),
+        (("demonstrations",), ["demonstrations", "kind=passing", "seed=0"]),
         (("sample", "OUT=a.npz", "NUM=7"), ["sample", "run=latest", "start=", "goal=", "out=a.npz", "num=7", "seed=0"]),
         (("sample",), ["sample", "run=latest", "start=", "goal=", "seed=0"]),
     ],

@@ -10,13 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from conflow.scene.social_force import Robots, walk
+
 # The two robots' nominal starts; each one's goal is the other's start.
 SIDES = ((-0.8, 0.0), (0.8, 0.0))
 
 # Amplitudes of the speed's harmonics in `passing`: a robot's speed stays between 0.2 and 1.8 of its mean.
 WARP = (0.3, 0.4, 0.1)
 
-# What `passing` keeps away from the radius, so that rounding to float32 changes no label.
+# What `passing` and `social` keep away from the radius, so that rounding to float32 changes no label.
 MARGIN = 1e-3
 
 
@@ -81,6 +83,47 @@ def passing(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor
 
     wanted = _wanted(closest.values, radius, generator)
     return bent(_bisection(lambda h: _distances(bent(h)).amin(dim=1), wanted, 3 * radius)).float()
+
+
+def social(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor:
+    """Two robots that swap sides and evade each other by the social-force model, x (num, T, 4) as (x1, y1, x2, y2).
+
+    Each robot has its own desired speed, drift, and strength and reach of repulsion, from indifferent to polite; see
+    `social_force`. Both evade to one side, of 65 % of the pairs to the right, but in 15 % they misunderstand. About
+    38 % come closer than `radius` at a waypoint. Those within MARGIN of it, in which a robot leaves the workspace or
+    does not arrive in time, are drawn again.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    kept: list[Tensor] = []
+    while sum(map(len, kept)) < num:
+        x, _ = walk(_robots(1000, generator), T, radius)
+        inside = (x.abs() <= 1).flatten(1).all(dim=1)  # NaN is not
+        kept.append(x[inside & ((_distances(x).amin(dim=1) - radius).abs() > MARGIN)])
+    return torch.cat(kept)[:num].float()
+
+
+KINDS: dict[str, Callable[..., Tensor]] = {"passing": passing, "social": social}
+"""Demonstrations of another kind than `swap`, for a file: called with num and seed."""
+
+
+def _robots(num: int, generator: torch.Generator) -> Robots:
+    """Pairs of robots with the habits of `social`."""
+
+    def between(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(num, 2, generator=generator, dtype=torch.float64)
+
+    start, goal = (end.double() for end in _ends(num, 0.04, generator))
+    side = torch.where(_some(0.65, num, generator), -1.0, 1.0)[:, None]
+    agree = torch.where(_some(0.85, num, generator), 1.0, -1.0)[:, None]
+    return Robots(
+        start,
+        goal,
+        speed=between(0.5, 1.0),
+        drift=between(-0.15, 0.15),
+        strength=between(0, 17.5),
+        reach=between(0.05, 0.12),
+        side=torch.cat([side, side * agree], dim=1).double(),
+    )
 
 
 def _uniform(generator: torch.Generator, *shape: int) -> Tensor:
