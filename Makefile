@@ -57,7 +57,7 @@ figures: .venv/installed  ## Draw the pictures of finished runs into runs/figure
 explain: .venv/installed  ## Draw why the covariant correction works, and what fewer collisions cost: PRESET=
 	@$(CONFLOW) explain preset=$(PRESET)
 
-demonstrations: .venv/installed  ## Write demonstrations of another kind, for ARGS="data.path=FILE": KIND=passing|social OUT= NUM= SEED=
+demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FILE": KIND=passing|social OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations kind=$(KIND) $(WRITTEN) seed=$(SEED)
 
 bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)

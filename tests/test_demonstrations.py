@@ -1,4 +1,4 @@
-"""Demonstrations of another kind: the generated passing, the file it is written to, and the command."""
+"""Demonstrations of other kinds: passing and the social-force planner, the file they are written to, the command."""
 
 import errno
 import os
@@ -17,7 +17,20 @@ from conflow import __main__ as command_line
 from conflow.experiment import config, signals
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.metrics import smoothness
-from conflow.scene.trajectories import SIDES, DemonstrationError, check, digest, load, passing, save, swap
+from conflow.flow.source import cgp, fit_rbf
+from conflow.scene.social_force import Robots, walk
+from conflow.scene.trajectories import (
+    KINDS,
+    SIDES,
+    DemonstrationError,
+    check,
+    digest,
+    load,
+    passing,
+    save,
+    social,
+    swap,
+)
 
 
 def nearest(x: Tensor) -> Tensor:
@@ -131,12 +144,176 @@ def test_the_bulge_is_a_raised_cosine_where_the_robots_pass() -> None:
     assert float(right[nearest(x) < 0.3, 0].double().mean()) == pytest.approx(0.65, abs=4 * (0.65 * 0.35 / 2000) ** 0.5)
 
 
-def test_a_seed_is_a_data_set() -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_is_a_data_set(kind: str) -> None:
     """The same seed gives the same bytes, whatever happens to the global generator; another one differs."""
-    x = passing(50, seed=7)
+    x = KINDS[kind](50, seed=7)
     torch.manual_seed(0)
-    assert digest(passing(50, seed=7)) == digest(x)
-    assert not bool((passing(50, seed=8)[:, 0] == x[:, 0]).any())
+    assert digest(KINDS[kind](50, seed=7)) == digest(x)
+    assert not bool((KINDS[kind](50, seed=8)[:, 0] == x[:, 0]).any())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_social_robots_some_collide_and_the_others_pass_barely_outside(seed: int) -> None:
+    """38 % collide; the median distance of the others is within a quarter of the radius, and no label on the edge."""
+    x = social(3000, seed=seed)
+    distance = nearest(x)
+    collides = distance < 0.3
+    # Of 37.9 % over 20 seeds, four standard errors of 3000 draws
+    assert float(collides.double().mean()) == pytest.approx(0.379, abs=4 * (0.38 * 0.62 / 3000) ** 0.5)
+    assert float((distance - 0.3).abs().min()) > 0.999e-3
+    assert 1.05 < float(distance[~collides].median()) / 0.3 < 1.25
+    assert float(distance[~collides].quantile(0.95)) / 0.3 < 1.6
+    assert 0.5 < float(distance[collides].quantile(0.05)) / 0.3 < float(distance[collides].median()) / 0.3 < 0.95
+
+
+def test_social_robots_are_demonstrations_that_accelerate_and_brake() -> None:
+    """Inside the workspace, in float32, from and to the jittered sides, and far less smooth than the swap."""
+    x = social(3000)
+    assert x.dtype == torch.float32
+    assert x.shape == (3000, 32, 4)
+    check(x, "generated")
+    sides = torch.tensor(SIDES)
+    for ends, nominal in ((x[:, 0], sides), (x[:, -1], sides.flip(0))):
+        off = (ends.unflatten(1, (2, 2)) - nominal).abs()
+        # float32 rounding of a coordinate below 1
+        assert bool((off <= 0.04 + 1e-7).all())
+        assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
+    feasible = smoothness(x[nearest(x) > 0.3])
+    assert 0.006 < float(feasible.quantile(0.05)) < float(feasible.quantile(0.95)) < 0.02
+    assert float(feasible.median()) > 2.5 * float(smoothness(swap(3000)).median())
+
+
+def test_what_social_robots_do_is_not_in_the_leading_modes() -> None:
+    """Of the variance about the fitted source's mean a tenth of a percent lies beyond its 8 modes, of the swap none."""
+
+    def beyond(x: Tensor) -> float:
+        source = cgp(32, *fit_rbf(x, (0, -1)))
+        residual = x.double() - source.mean(source.observe(x.double()))
+        held = torch.einsum("tm,ntd->nmd", source.modes[:, :8], residual)
+        return 1 - float(held.square().sum() / residual.square().sum())
+
+    assert beyond(swap(2000)) < 1e-9
+    assert beyond(social(2000)) > 5e-4
+
+
+def test_more_social_robots_begin_with_the_same_ones() -> None:
+    """Whatever is drawn again, and in how many portions."""
+    assert torch.equal(social(2500, seed=5)[:30], social(30, seed=5))
+
+
+def pairs(num: int, **habits: float) -> Robots:
+    """Pairs of robots that swap sides, with random habits in float64 but for those given."""
+    generator = torch.Generator().manual_seed(0)
+
+    def between(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(num, 2, generator=generator, dtype=torch.float64)
+
+    sides = torch.tensor(SIDES, dtype=torch.float64)
+    robots = Robots(
+        start=sides + torch.stack([between(-0.04, 0.04), between(-0.04, 0.04)], dim=2),
+        goal=sides.flip(0) + torch.stack([between(-0.04, 0.04), between(-0.04, 0.04)], dim=2),
+        speed=between(0.5, 1),
+        drift=between(-0.1, 0.1),
+        repulsion=between(0, 10),
+        reach=between(0.05, 0.1),
+        sidestep=between(-5, 5),
+        sight=between(0.3, 0.5),
+    )
+    return robots._replace(**{name: torch.full_like(robots.speed, value) for name, value in habits.items()})
+
+
+def test_a_walk_does_not_depend_on_the_batch_or_the_threads() -> None:
+    """To the last bit: a part of the pairs in another order, and two threads."""
+    robots = pairs(1000)
+    x, arrival = walk(robots, 32, 0.3)
+    some = torch.randperm(1000, generator=torch.Generator().manual_seed(0))[:101]
+    part = walk(Robots(*(habit[some] for habit in robots)), 32, 0.3)
+    torch.testing.assert_close(part, (x[some], arrival[some]), rtol=0, atol=0, equal_nan=True)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1 if threads > 1 else 2)
+        torch.testing.assert_close(walk(robots, 32, 0.3), (x, arrival), rtol=0, atol=0, equal_nan=True)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_a_walk_has_the_symmetries_of_the_plane() -> None:
+    """A mirror image of pairs walks the mirror image, a rotated one the rotated, and the robots can be exchanged."""
+    robots = pairs(200)
+    x, arrival = walk(robots, 32, 0.3)
+    mirror = torch.tensor([1.0, -1.0], dtype=torch.float64)
+    image = robots._replace(
+        start=robots.start * mirror, goal=robots.goal * mirror, drift=-robots.drift, sidestep=-robots.sidestep
+    )
+    assert torch.equal(walk(image, 32, 0.3)[0], x * mirror.repeat(2))
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7], [0.7, 0.0]], dtype=torch.float64))
+    turned = robots._replace(start=robots.start @ turn.mT, goal=robots.goal @ turn.mT)
+    expected = (x.unflatten(2, (2, 2)) @ turn.mT).flatten(2)
+    # float64 rounding, which a head-on encounter magnifies
+    torch.testing.assert_close(walk(turned, 32, 0.3)[0], expected, rtol=0, atol=1e-6)
+    exchanged = walk(Robots(*(habit.flip(1) for habit in robots)), 32, 0.3)
+    assert torch.equal(exchanged[0], x.roll(2, dims=2))
+    assert torch.equal(exchanged[1], arrival.flip(1))
+
+
+def test_robots_that_feel_nothing_walk_straight_at_their_speed() -> None:
+    """Progress is monotone and begins at rest; before they brake, the two have a ratio of the desired speeds."""
+    robots = pairs(200, repulsion=0.0, sidestep=0.0, drift=0.0)
+    x, _ = walk(robots, 400, 0.3)
+    progress, deviation = along_and_across(x)
+    assert float(deviation.abs().max()) < 1e-12
+    step = progress.diff(dim=2)
+    assert float(step.min()) > -1e-12
+    # The last step to the goal is another.
+    top = step.where(progress[..., 1:] < 0.9, 0.0).amax(dim=2)
+    ratio = (top * (robots.goal - robots.start).norm(dim=2)).unbind(dim=1)
+    # They brake within 0.6 of the goal; after 0.9 and more the fastest has approached its speed to exp(-0.9 / 0.2).
+    torch.testing.assert_close(ratio[0] / ratio[1], robots.speed[:, 0] / robots.speed[:, 1], rtol=0.015, atol=0)
+    assert bool((step[..., 0] < 0.2 * top).all())
+
+
+def test_who_has_arrived_stays_and_the_later_one_ends_the_walk() -> None:
+    robots = pairs(500)
+    x, arrival = walk(robots, 64, 0.3)
+    assert torch.equal(x[:, 0], robots.start.flatten(1))
+    assert torch.equal(x[:, -1], robots.goal.flatten(1))
+    assert torch.equal(arrival.amax(dim=1), torch.ones(500, dtype=torch.float64))
+    there = torch.linspace(0, 1, 64, dtype=torch.float64) > arrival[..., None]
+    at_goal = (x.unflatten(2, (2, 2)).transpose(1, 2) == robots.goal[:, :, None]).all(dim=3)
+    assert bool(at_goal[there].all())
+    # A waypoint before, it is not
+    assert not bool(at_goal[torch.linspace(0, 1, 64, dtype=torch.float64) < arrival[..., None] - 1 / 63].any())
+    early = 1 - arrival.amin(dim=1)
+    assert float(early.quantile(0.25)) > 0.04
+    assert float(early.quantile(0.75)) > 0.15
+
+
+def test_a_robot_that_does_not_arrive_spoils_its_own_pair_alone() -> None:
+    robots = pairs(3)
+    slow = robots._replace(speed=robots.speed.index_fill(0, torch.tensor([1]), 0.05))
+    x, arrival = walk(slow, 32, 0.3)
+    assert bool(x[1].isnan().all())
+    assert bool(arrival[1].isnan().all())
+    assert torch.equal(x[[0, 2]], walk(robots, 32, 0.3)[0][[0, 2]])
+
+
+def test_stronger_forces_keep_robots_apart_on_the_side_that_they_prefer() -> None:
+    """Without forces all collide; repulsion and sidestep each widen the median distance; both step to their right."""
+
+    def median(repulsion: float, sidestep: float) -> float:
+        return float(nearest(walk(pairs(500, repulsion=repulsion, sidestep=sidestep), 32, 0.3)[0]).median())
+
+    assert float(nearest(walk(pairs(500, repulsion=0.0, sidestep=0.0), 32, 0.3)[0]).max()) < 0.3
+    assert median(0, 0) < median(0, 2) < median(0, 4)
+    assert median(0, 2) < median(4, 2) < median(8, 2)
+
+    for sidestep in (-4.0, 4.0):
+        x, _ = walk(pairs(500, repulsion=4.0, sidestep=sidestep), 32, 0.3)
+        where = (x[..., :2] - x[..., 2:]).norm(dim=2).argmin(dim=1)
+        _, deviation = along_and_across(x)
+        beside = deviation.take_along_dim(where[:, None, None], dim=2).sum(dim=1) * sidestep
+        assert float((beside > 0).double().mean()) > 0.99
 
 
 @pytest.mark.parametrize(("T", "radius"), [(4, 0.3), (32, 0.05)])
@@ -195,17 +372,23 @@ def demonstrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
 
 
 @pytest.mark.parametrize(
-    ("arguments", "name", "num", "seed"),
-    [((), "passing.npz", 3000, 0), (("out=other.npz", "num=50", "seed=3"), "other.npz", 50, 3)],
+    ("arguments", "name", "written"),
+    [
+        ((), "passing.npz", passing(3000)),
+        (("out=other.npz", "num=50", "seed=3"), "other.npz", passing(50, seed=3)),
+        (("kind=social", "num=50"), "social.npz", social(50)),
+        (("kind=social", "out=other.npz", "num=50", "seed=3"), "other.npz", social(50, seed=3)),
+    ],
+    ids=["defaults", "passing", "social", "social elsewhere"],
 )
 def test_the_command_writes_what_it_says(
-    arguments: tuple[str, ...], name: str, num: int, seed: int, demonstrations: Run
+    arguments: tuple[str, ...], name: str, written: Tensor, demonstrations: Run
 ) -> None:
     code, out, err = demonstrations(*arguments)
     assert (code, err) == (0, "")
     assert out == f"Written: {name}; train on it with: make train ARGS=data.path={name}\n"
     assert [path.name for path in Path().iterdir()] == [name]
-    assert torch.equal(load(name).x, passing(num, seed=seed))
+    assert torch.equal(load(name).x, written)
 
 
 def test_the_command_never_overwrites(demonstrations: Run) -> None:
@@ -223,6 +406,8 @@ def test_the_command_never_overwrites(demonstrations: Run) -> None:
         ("out=no/passing.npz", "out=no/passing.npz: No such file or directory, expected a new file in an existing fol"),
         ("out=passing.csv", "out=passing.csv: expected a name that ends in .npz"),
         (f"out={'a' * 300}.npz", f"out={'a' * 300}.npz: File name too long, expected"),
+        ("kind=socal", "kind=socal: expected passing or social; did you mean social?"),
+        ("kind=", "kind=: expected passing or social"),
         ("num=9", "num=9: expected a whole number of at least 10 and at most 100000"),
         ("num=many", "num=many: expected a whole number"),
         ("seed=-1", "seed=-1: expected a whole number of at least 0"),
@@ -245,6 +430,7 @@ def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: 
             ("demonstrations", "OUT=a b.npz", "NUM=50", "SEED=3"),
             ["demonstrations", "kind=passing", "out=a b.npz", "num=50", "seed=3"],
         ),
+        (("demonstrations", "KIND=social"), ["demonstrations", "kind=social", "seed=0"]),
         (("demonstrations",), ["demonstrations", "kind=passing", "seed=0"]),
         (("sample", "OUT=a.npz", "NUM=7"), ["sample", "run=latest", "start=", "goal=", "out=a.npz", "num=7", "seed=0"]),
         (("sample",), ["sample", "run=latest", "start=", "goal=", "seed=0"]),

@@ -1,47 +1,52 @@
-"""The social-force model of two pedestrians or robots that meet (Helbing and Molnar 1995, Phys. Rev. E 51, 4282)."""
+"""Two robots that evade each other by the social-force model (Helbing and Molnar, Phys. Rev. E 51, 4282, 1995)."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-# Relaxation time, time step and the longest time that is simulated; a speed is in half widths of the workspace a unit.
-TAU, STEP, LONGEST = 0.15, 0.02, 8.0
+# Units: half the workspace's width, and seconds.
+STEP = 0.02
+LONGEST = 8.0
 
-# Deceleration with which a robot comes to rest, and how near its goal it takes the last step.
-BRAKE, REACHED = 1.5, 0.01
+# Relaxation time towards the desired velocity. A robot begins to brake where it would need three times that to arrive:
+# four would be critical damping, and from within REACHED of the goal it takes the last step.
+TAU = 0.2
+BRAKING = 3 * TAU
+REACHED = 0.01
 
-# What is left of a repulsion from a robot that is not ahead.
+# The share of a repulsion that a robot feels from behind.
 BEHIND = 0.2
 
 
 class Robots(NamedTuple):
-    """Pairs of robots and their habits: a pair of vectors (num, 2, 2) or of numbers (num, 2) each.
+    """Pairs of robots and their habits; of each robot a vector, (num, 2, 2), or a number, (num, 2).
 
     Attributes:
         start, goal: positions.
-        speed: the desired one.
-        drift: angle from the goal's direction to the desired one, positive to the left.
-        strength, reach: the repulsion A exp((radius - d) / B) from a robot at distance d.
-        side: where a robot evades another one ahead, 1 to its left and -1 to its right.
+        speed: the desired one, v.
+        drift: the angle from the goal's direction to the desired one, positive to the left.
+        repulsion, reach: A and B of A exp((radius - d) / B), away from a robot at distance d.
+        sidestep, sight: the same for the force to the side, to the left of the goal's direction where A > 0.
     """
 
     start: Tensor
     goal: Tensor
     speed: Tensor
     drift: Tensor
-    strength: Tensor
+    repulsion: Tensor
     reach: Tensor
-    side: Tensor
+    sidestep: Tensor
+    sight: Tensor
 
 
 def walk(robots: Robots, T: int, radius: float) -> tuple[Tensor, Tensor]:
-    """Trajectories x (num, T, 4) over the time that the later robot takes, and each robot's share of it, (num, 2).
+    """Trajectories x (num, T, 4) from rest until both have arrived, and when each had, as a share of it, (num, 2).
 
-    dv/dt = (v_desired - v) / TAU + A exp((radius - d) / B) ((BEHIND + (1 - BEHIND) c) n + side c n_left), from rest
-    at the start, with n the unit vector away from the other robot and c the cosine at which that is ahead, 0 if it is
-    not. v_desired points to the goal, turned by `drift`, at the desired speed or that of braking. Who arrives stays.
-    NaN where a robot does not arrive within LONGEST.
+    dv/dt = (v_desired - v) / TAU + f (BEHIND + (1 - BEHIND) (1 + c) / 2) n + g max(c, 0) n_left, in semi-implicit Euler
+    steps: f and g are the repulsion and the sidestep, n points away from the other robot, n_left to the left of the
+    goal, and c is the cosine of the angle between the goal and the other robot. Who has arrived stays. All is NaN
+    of a pair of which a robot has not arrived by LONGEST.
     """
     position, velocity = robots.start, torch.zeros_like(robots.start)
     arrival = torch.full_like(robots.speed, torch.nan)
@@ -49,41 +54,41 @@ def walk(robots: Robots, T: int, radius: float) -> tuple[Tensor, Tensor]:
     for step in range(1, round(LONGEST / STEP) + 1):
         velocity = velocity + STEP * _acceleration(robots, position, velocity, radius)
         position = position + STEP * velocity
-        reached = torch.linalg.vector_norm(robots.goal - position, dim=2) < REACHED
-        arrival = arrival.where(~(arrival.isnan() & reached), step)
-        at_rest = ~arrival.isnan()[..., None]
-        position = torch.where(at_rest, robots.goal, position)
-        velocity = velocity.where(~at_rest, 0.0)
+        near = torch.linalg.vector_norm(robots.goal - position, dim=2) < REACHED
+        arrival = torch.where(near & arrival.isnan(), step, arrival)
+        position = torch.where(arrival.isnan()[..., None], position, robots.goal)
         path.append(position)
-    latest = arrival.amax(dim=1, keepdim=True)
-    return _resampled(torch.stack(path, dim=1).flatten(2), latest, T), arrival / latest
+    end = arrival.amax(dim=1, keepdim=True)
+    return _resampled(torch.stack(path, dim=1).flatten(2), end, T), arrival / end
 
 
 def _acceleration(robots: Robots, position: Tensor, velocity: Tensor, radius: float) -> Tensor:
-    to_goal = robots.goal - position
-    left_to_go = torch.linalg.vector_norm(to_goal, dim=2).clamp(min=1e-9)[..., None]
-    ahead = to_goal / left_to_go
+    ahead, to_go = _direction(robots.goal - position)
     left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=2)
-    turn = robots.drift[..., None]
-    speed = torch.minimum(robots.speed[..., None], (2 * BRAKE * left_to_go).sqrt())
-    desired = speed * (turn.cos() * ahead + turn.sin() * left)
+    heading = robots.drift.cos()[..., None] * ahead + robots.drift.sin()[..., None] * left
+    desired = torch.minimum(robots.speed[..., None], to_go / BRAKING) * heading
 
-    away = position - position.flip(1)
-    distance = torch.linalg.vector_norm(away, dim=2, keepdim=True).clamp(min=1e-9)
-    away = away / distance
-    repulsion = robots.strength[..., None] * ((radius - distance) / robots.reach[..., None]).clamp(max=1).exp()
-    c = -(away * ahead).sum(dim=2, keepdim=True).clamp(max=0)
-    evasion = (BEHIND + (1 - BEHIND) * c) * away + robots.side[..., None] * c * left
-    return (desired - velocity) / TAU + repulsion * evasion
+    away, distance = _direction(position - position.flip(1))
+    c = -(away * ahead).sum(dim=2, keepdim=True)
+    repulsion = _force(robots.repulsion, robots.reach, radius - distance) * (BEHIND + (1 - BEHIND) * (1 + c) / 2)
+    sidestep = _force(robots.sidestep, robots.sight, radius - distance) * c.clamp(min=0)
+    return (desired - velocity) / TAU + repulsion * away + sidestep * left
 
 
-def _resampled(path: Tensor, latest: Tensor, T: int) -> Tensor:
-    """T waypoints of `path` (num, steps, 4), linear between steps, evenly from the first one to `latest` (num, 1)."""
-    at = latest.nan_to_num(1.0) * torch.linspace(0, 1, T, dtype=torch.float64)
-    before = at.long().clamp(max=path.shape[1] - 2)
-    x = torch.lerp(
-        path.take_along_dim(before[..., None], dim=1),
-        path.take_along_dim(before[..., None] + 1, dim=1),
-        (at - before)[..., None],
-    )
-    return x.where(~latest.isnan()[..., None], torch.nan)
+def _direction(v: Tensor) -> tuple[Tensor, Tensor]:
+    """The unit vectors and the lengths of v (num, 2, 2), (num, 2, 1), without a division by zero."""
+    length = torch.linalg.vector_norm(v, dim=2, keepdim=True).clamp(min=1e-9)
+    return v / length, length
+
+
+def _force(strength: Tensor, reach: Tensor, depth: Tensor) -> Tensor:
+    """A exp(depth / B), (num, 2, 1), no more than A e: robots that overlap do not fly apart."""
+    return strength[..., None] * (depth / reach[..., None]).clamp(max=1).exp()
+
+
+def _resampled(path: Tensor, end: Tensor, T: int) -> Tensor:
+    """T waypoints of `path` (num, steps, 4), evenly from its first step to `end` (num, 1), linear between steps."""
+    at = end.nan_to_num() * torch.linspace(0, 1, T, dtype=path.dtype)
+    step = at.long().clamp(max=path.shape[1] - 2)[..., None]
+    x = torch.lerp(path.take_along_dim(step, dim=1), path.take_along_dim(step + 1, dim=1), at[..., None] - step)
+    return x.where(~end.isnan()[..., None], torch.nan)

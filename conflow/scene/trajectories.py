@@ -88,41 +88,43 @@ def passing(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor
 def social(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor:
     """Two robots that swap sides and evade each other by the social-force model, x (num, T, 4) as (x1, y1, x2, y2).
 
-    Each robot has its own desired speed, drift, and strength and reach of repulsion, from indifferent to polite; see
-    `social_force`. Both evade to one side, of 65 % of the pairs to the right, but in 15 % they misunderstand. About
-    38 % come closer than `radius` at a waypoint. Those within MARGIN of it, in which a robot leaves the workspace or
-    does not arrive in time, are drawn again.
+    See `social_force.walk`. Each robot has habits of its own, from indifferent to polite. Both sidestep to the right
+    in 65 % of the trajectories and to the left in the others, but in 10 % one of them misunderstands. With the default
+    radius about 38 % collide at a waypoint. Drawn again is what comes within MARGIN of `radius`, leaves the workspace
+    or does not arrive. The first n of a seed are the same for every num >= n.
     """
     generator = torch.Generator().manual_seed(seed)
-    kept: list[Tensor] = []
-    while sum(map(len, kept)) < num:
-        x, _ = walk(_robots(1000, generator), T, radius)
-        inside = (x.abs() <= 1).flatten(1).all(dim=1)  # NaN is not
-        kept.append(x[inside & ((_distances(x).amin(dim=1) - radius).abs() > MARGIN)])
-    return torch.cat(kept)[:num].float()
+    x = torch.empty(0, T, 4)
+    while len(x) < num:
+        drawn, _ = walk(_habits(1000, generator), T, radius)
+        inside = (drawn.abs() <= 1).flatten(1).all(dim=1)  # which NaN is not
+        clear = (_distances(drawn).amin(dim=1) - radius).abs() > MARGIN
+        x = torch.cat([x, drawn[inside & clear].float()])
+    return x[:num]
 
 
 KINDS: dict[str, Callable[..., Tensor]] = {"passing": passing, "social": social}
-"""Demonstrations of another kind than `swap`, for a file: called with num and seed."""
+"""Demonstrations of another kind than `swap`, to be written to a file: generators that take num and seed."""
 
 
-def _robots(num: int, generator: torch.Generator) -> Robots:
-    """Pairs of robots with the habits of `social`."""
+def _habits(num: int, generator: torch.Generator) -> Robots:
+    """Pairs of the robots of `social`."""
 
     def between(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(num, 2, generator=generator, dtype=torch.float64)
 
     start, goal = (end.double() for end in _ends(num, 0.04, generator))
-    side = torch.where(_some(0.65, num, generator), -1.0, 1.0)[:, None]
-    agree = torch.where(_some(0.85, num, generator), 1.0, -1.0)[:, None]
+    side = torch.where(_some(0.65, num, generator), -1.0, 1.0)
+    understood = torch.where(_some(0.9, num, generator), 1.0, -1.0)
     return Robots(
         start,
         goal,
-        speed=between(0.5, 1.0),
-        drift=between(-0.15, 0.15),
-        strength=between(0, 17.5),
-        reach=between(0.05, 0.12),
-        side=torch.cat([side, side * agree], dim=1).double(),
+        speed=between(0.45, 1.1),
+        drift=between(-0.1, 0.1),
+        repulsion=between(0, 10),
+        reach=between(0.05, 0.1),
+        sidestep=between(1, 5) * torch.stack([side, side * understood], dim=1),
+        sight=between(0.3, 0.5),
     )
 
 
