@@ -9,6 +9,7 @@ from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.metrics import smoothness
 from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
+from conflow.flow.network import SpectralMLP
 from conflow.flow.path import guided_path, interpolate
 from conflow.flow.sampler import integrate
 from conflow.flow.source import ENDPOINTS, fit_rbf
@@ -239,3 +240,20 @@ def test_guidance_at_the_end_acts_where_its_training_does(t: float) -> None:
     pushed = t * flow.u_c(x + (1 - t) * v)
     assert bool(pushed.any()) == (t > 0)
     torch.testing.assert_close(flow.field("robot")(x, times), v + weight * pushed)
+
+
+def test_the_norm_of_the_modes_weighs_each_by_its_width() -> None:
+    """A residual along one mode counts sigma_1 of the leading mode over its own; with equal widths both norms agree."""
+    flow = model("ablation=plus", "source.fit=false", "source.modes=null", "train.norm=modes")
+    plain = model("ablation=plus", "source.fit=false", "source.modes=null")
+    v = flow.v
+    assert isinstance(v, SpectralMLP)
+    u = torch.randn(3, *swap(1).shape[1:], generator=noise())
+    u[:, [0, -1]] = 0  # where the source is conditioned there are no modes
+    v.variance.fill_(0.2)
+    free = u.shape[1] / v.modes.shape[1]  # the mean is over fewer numbers
+    torch.testing.assert_close(flow.distance(u, 0 * u), free * plain.distance(u, 0 * u))
+    v.variance[1] = 0.2 / 9
+    along = [v.modes[:, k : k + 1].expand(1, -1, u.shape[2]) for k in (0, 1)]
+    first, second = (float(flow.distance(mode, 0 * mode)) for mode in along)
+    assert second == pytest.approx(3 * first, rel=1e-5)

@@ -33,6 +33,7 @@ Smoothing = Literal["filter", "covariant"]
 Place = Literal["point", "end"]
 Mask = Literal["violates", "feasible"]
 PathKind = Literal["linear", "guided"]
+Norm = Literal["waypoints", "modes"]
 Tree = dict[str, Any]
 
 
@@ -136,6 +137,7 @@ class Train:
     lr: Positive
     schedule: Schedule
     clip: Positive
+    norm: Norm
     log_every: Count
     val_every: Count
 
@@ -476,6 +478,8 @@ def _check(config: Config) -> None:
         config.correction.smoothing == "covariant" or config.network.kind == "spectral"
     ):
         raise ConfigError("source.kind=gaussian: expected gp or cgp where the source's covariance is asked for")
+    if config.train.norm == "modes" and config.network.kind != "spectral":
+        raise ConfigError("train.norm=modes: expected network.kind=spectral, which has modes")
     if config.network.sees_ends and config.network.kind == "spectral":
         raise ConfigError("network.sees_ends=True: expected network.kind=resmlp, spectral takes start and goal from x")
     if config.correction.keep_ends and config.correction.smoothing == "covariant":

@@ -79,7 +79,7 @@ class ConFlow(LightningModule):
         t = torch.rand(len(x_1), device=x_1.device, generator=noise)
         if self.config.correction.path == "guided":
             x_t, u_t = guided_path(x_0, x_1, t, self.u_c, lambda_c * M)
-            return F.mse_loss(self.v(x_t, t, ends), u_t)
+            return self.distance(self.v(x_t, t, ends), u_t)
         x_t = interpolate(x_0, x_1, t)
         v = self.v(x_t, t, ends)
         if self.config.correction.at == "end":
@@ -87,7 +87,14 @@ class ConFlow(LightningModule):
             u_c = t[:, None, None] * self.u_c(end(x_t, v.detach(), t))
         else:
             u_c = M[:, None, None] * self.u_c(x_t)
-        return F.mse_loss(v, velocity(x_0, x_1) + lambda_c * u_c)
+        return self.distance(v, velocity(x_0, x_1) + lambda_c * u_c)
+
+    def distance(self, v: Tensor, u: Tensor) -> Tensor:
+        """|v - u|^2 of velocities (batch, T, D), the mean over batch, waypoints and dimensions, or over modes."""
+        if self.config.train.norm == "modes":
+            assert isinstance(self.v, SpectralMLP)  # the config was checked
+            v, u = self.v.balanced(v), self.v.balanced(u)
+        return F.mse_loss(v, u)
 
     def field(self, setting: Setting, ends: Tensor | None = None) -> Field:
         """The velocity field of a setting, for starts and goals (batch, 2, D) where the network sees them."""

@@ -8,6 +8,8 @@ from conflow.flow.source import Source
 
 SEEN = 4.0
 """Standard deviations beyond which there is next to nothing to learn from."""
+NARROWEST = 1000.0
+"""How many times narrower than the leading mode one is that still counts as narrow, and not as empty."""
 
 
 class ResidualBlock(nn.Module):
@@ -111,6 +113,17 @@ class SpectralMLP(nn.Module):
     def coordinates(self, x: Tensor) -> Tensor:
         """z = E^T (x - W x_O), (batch, m, D)."""
         return self.modes.mT @ (x - self.mean_map @ x[:, self.observed])
+
+    def balanced(self, u: Tensor) -> Tensor:
+        """A velocity u (batch, T, D) in the modes, each over the root of its sigma_1, (batch, m, D).
+
+        A field that is nearest in this norm is the same as in any other, the conditional mean, but a network that
+        cannot be everywhere attends less to the wide modes and more to the narrow ones, in which roughness is. The
+        leading mode counts as it is, and none more than a thousandfold: those that demonstrations do not have are
+        in closed form.
+        """
+        sigma_1 = self.variance.sqrt()
+        return (sigma_1[0] / sigma_1).clamp(max=NARROWEST).sqrt() * (self.modes.mT @ u)
 
     def forward(self, x: Tensor, t: Tensor, ends: Tensor | None = None) -> Tensor:
         """The velocity at x (batch, T, D) and t (batch,), (batch, T, D); start and goal it takes from x."""
