@@ -294,6 +294,8 @@ def test_a_bench_survives_its_file_and_prints_in_every_form(elsewhere: Path) -> 
     said = {"hardware": "a machine", "threads": "2", "versions": "torch 2", "date": "today"}
     bench = Bench(said, rows, [scaling.Point("batch", 1, 1.0, 1.0)], [curve("plus", [1, 2, 3])])
     path = elsewhere / "runs" / "reference" / "bench.json"
+    with pytest.raises(ConfigError, match=r"bench\.json: expected a bench, as a checkout .* has it, found none"):
+        Bench.read(suite.REFERENCE)
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(asdict(bench)))
     assert Bench.read(path) == bench
@@ -308,5 +310,5 @@ def test_a_bench_survives_its_file_and_prints_in_every_form(elsewhere: Path) -> 
             table.render(bench, form, console)  # type: ignore[arg-type]  # one of its forms
         assert expected in captured.get()
     path.write_text("{}")
-    with pytest.raises(ConfigError, match=r"bench\.json: expected a bench"):
+    with pytest.raises(ConfigError, match=r"bench\.json: expected a bench, found"):
         Bench.read(suite.REFERENCE)

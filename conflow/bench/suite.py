@@ -55,6 +55,8 @@ class Bench:
             rows = [Row(**{**row, "target": row["target"] and Target(**row["target"])}) for row in found["rows"]]
             points, curves = [Point(**one) for one in found["points"]], [Curve(**one) for one in found["curves"]]
             return cls(found["origin"], rows, points, curves)
+        except FileNotFoundError:
+            raise ConfigError(f"{path}: expected a bench, as a checkout of the repository has it, found none") from None
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise ConfigError(f"{path}: expected a bench, found {' '.join(str(error).split())}") from None
 

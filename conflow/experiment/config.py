@@ -24,7 +24,9 @@ from conflow.flow.correction import Edges
 from conflow.flow.sampler import Guidance, Solver
 from conflow.scene.constraint import BarrierShape, Obstacle, Reduction
 
-CONF = Path(__file__).parents[2] / "conf"
+PACKAGE = Path(__file__).parents[1]
+CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
+"""Inside the package where it was installed from a wheel, beside it in a checkout."""
 
 SourceKind = Literal["gaussian", "gp", "cgp"]
 Schedule = Literal["constant", "one_cycle"]

@@ -104,7 +104,8 @@ def from_files() -> list[Record]:
     """
     paths = sorted(FOLDER.glob("*.json"))
     if not paths:
-        raise ConfigError(f"reference: expected records in {FOLDER}, found none; try: make reference")
+        expected = f"expected records in {FOLDER}, as a checkout of the repository has them"
+        raise ConfigError(f"reference: {expected}, found none; try: make reference")
     return sorted(map(Record.read, paths), key=lambda record: record.seed)
 
 

@@ -25,6 +25,7 @@ from mlflow.data.numpy_dataset import from_numpy
 from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
 from mlflow.exceptions import MlflowException
 
+from conflow import __version__
 from conflow.experiment import alive, signals
 from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
@@ -310,12 +311,15 @@ def _tags(config: Config, data: DemonstrationData) -> dict[str, str]:
 
 
 def origin() -> dict[str, str]:
-    """What is at work: this program's revision, the versions of its libraries, the hardware."""
-    sha, dirty = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+    """What is at work: this program's revision, its version and those of its libraries, the hardware."""
+    # An installed package may lie in a repository that is not its own, such as its user's.
+    ours = _git("ls-files", "--error-unmatch", Path(__file__).name) is not None
+    sha, dirty = (_git("rev-parse", "HEAD"), _git("status", "--porcelain")) if ours else (None, None)
+    versions = {"conflow": __version__} | {name: version(name) for name in ("torch", "lightning", "mlflow")}
     return {
         "git_sha": sha if sha is not None else "unknown",
         "git_dirty": str(bool(dirty)).lower() if dirty is not None else "unknown",
-        "versions": ", ".join(f"{name} {version(name)}" for name in ("torch", "lightning", "mlflow")),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
         "hardware": _hardware(),
         "threads": str(torch.get_num_threads()),
     }
