@@ -1,8 +1,11 @@
+import shutil
+from pathlib import Path
+
 import pytest
 import yaml
 
 from conflow.experiment import config
-from conflow.experiment.config import CONF, ConfigError
+from conflow.experiment.config import CONF, SIZES, ConfigError
 
 # What each ablation may change of the defaults; "changing only what its name says".
 CHANGES = {
@@ -50,12 +53,90 @@ def test_an_ablation_changes_only_what_its_name_says(ablation: str) -> None:
     assert changes(f"ablation={ablation}") - {"ablation"} == CHANGES[ablation]
 
 
-@pytest.mark.parametrize("preset", ["long", "paper", "quick", "smoke"])
+def written(axis: str, name: str) -> set[str]:
+    """The settings that a file of conf/ sets, also those that it sets to the default."""
+    tree = yaml.safe_load((CONF / axis / f"{name}.yaml").read_text())
+    tree.pop("times", None)
+    return set(config.flatten(tree))
+
+
+# The solver's steps belong to both: a method may do with few, and smoke tests must.
+SHARED = {"sample.steps"}
+OF_PRESETS = set(SIZES) | {"train.lr", "train.schedule"}
+
+
+@pytest.mark.parametrize("preset", config.names("preset"))
 def test_a_preset_says_how_much_compute_and_nothing_about_the_method(preset: str) -> None:
-    assert all(
-        key.split(".")[0] in {"preset", "network", "train"} or key in {"data.num", "sample.num", "sample.steps"}
-        for key in changes(f"preset={preset}")
-    )
+    assert written("preset", preset) <= OF_PRESETS | SHARED
+
+
+@pytest.mark.parametrize("ablation", config.names("ablation"))
+def test_an_ablation_says_nothing_about_how_much_compute(ablation: str) -> None:
+    """What presets set it may multiply, so that every preset stays what its name says."""
+    assert not written("ablation", ablation) & OF_PRESETS
+    with_it, without = (config.load(["preset=smoke", f"ablation={name}"]) for name in (ablation, "cgp"))
+    assert with_it.train.max_steps <= without.train.max_steps
+    assert with_it.train.batch_size * with_it.network.hidden <= without.train.batch_size * without.network.hidden
+    assert with_it.sample.num <= 5 * without.sample.num
+
+
+@pytest.fixture
+def ablation_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file of an ablation `mine`, to be written, beside all others."""
+    monkeypatch.setattr(config, "CONF", shutil.copytree(CONF, tmp_path / "conf"))
+    return tmp_path / "conf" / "ablation" / "mine.yaml"
+
+
+def test_times_multiplies_what_the_preset_says_and_arguments_are_absolute(ablation_file: Path) -> None:
+    ablation_file.write_text("times: {train.max_steps: 0.4, sample.num: 5}")
+    for preset, steps, num in (("paper", 8000, 10240), ("quick", 1600, 10240), ("smoke", 16, 320)):
+        settings = config.load(["ablation=mine", f"preset={preset}"])
+        assert (settings.train.max_steps, settings.sample.num) == (steps, num)
+    settings = config.load(["ablation=mine", "train.max_steps=7"])
+    assert (settings.train.max_steps, settings.sample.num) == (7, 10240)
+    # What leaves is plain numbers: the same config, however it was asked for.
+    assert settings == config.load(["ablation=mine", "sample.num=10240", "train.max_steps=7"])
+    assert config.from_tree(settings.tree()) == settings
+
+
+def test_times_leaves_at_least_the_smallest_number_that_a_setting_takes(ablation_file: Path) -> None:
+    ablation_file.write_text("times: {train: {max_steps: 1.0e-9}, sample: {num: 1.0e-9}, data: {num: 1.0e-9}}")
+    settings = config.load(["ablation=mine"])
+    assert (settings.train.max_steps, settings.sample.num, settings.data.num) == (1, 2, 10)
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ("{train.max_stepz: 2}", "train.max_stepz=2: expected one of data.num, "),
+        ("{train.max_stepz: 2}", "did you mean train.max_steps?"),
+        ("{correction.lambda_c: 2}", "correction.lambda_c=2: expected one of data.num, "),
+        ("{3: 2}", "3=2: expected one of data.num, "),
+        *((f"{{sample.num: {factor}}}", "expected a number above 0 and at most") for factor in (0, -1, ".nan", ".inf")),
+        *(
+            (f"{{sample.num: {factor}}}", "expected a number above 0 and at most")
+            for factor in ("much", "true", "null")
+        ),
+        (f"{{sample.num: {10**400}}}", "expected a number above 0 and at most"),
+        ("{sample.num: 1.0e+9}", "expected a whole number of at least 2 and at most 1000000000"),
+        ("3", "expected settings and what to multiply them by, found 3"),
+    ],
+)
+def test_a_bad_factor_is_refused_in_one_line_that_names_the_file(times: str, said: str, ablation_file: Path) -> None:
+    ablation_file.write_text(f"times: {times}")
+    with pytest.raises(ConfigError) as refused:
+        config.load(["ablation=mine"])
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert str(refused.value).startswith("conf/ablation/mine.yaml: times" if "1.0e+9" not in times else "sample.num=")
+
+
+def test_only_an_ablation_multiplies(ablation_file: Path) -> None:
+    (ablation_file.parents[1] / "preset" / "mine.yaml").write_text("times: {sample.num: 2}")
+    with pytest.raises(ConfigError, match=r"times\.sample\.num: no such setting"):
+        config.load(["preset=mine"])
+    with pytest.raises(ConfigError, match=r"times\.sample\.num: no such setting"):
+        config.load(["times.sample.num=2"])
 
 
 def test_preset_paper_is_the_appendix() -> None:

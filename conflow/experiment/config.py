@@ -39,6 +39,17 @@ Norm = Literal["waypoints", "modes"]
 Tree = dict[str, Any]
 
 
+SIZES = (
+    "data.num",
+    "network.hidden",
+    "network.blocks",
+    "train.max_steps",
+    "train.batch_size",
+    "train.log_every",
+    "train.val_every",
+    "sample.num",
+)
+"""How much is computed: whole numbers that presets set, and that an ablation does not set but may multiply."""
 MOST_NUMBERS = 64
 """The longest list that a setting may be: OmegaConf takes its time over each number."""
 
@@ -196,22 +207,53 @@ def names(axis: str) -> list[str]:
 def load(arguments: Sequence[str] = ()) -> Config:
     """conf/base.yaml, then the preset, then the ablation, then arguments `key=value`, checked.
 
+    An ablation's block `times` multiplies what base and preset say, so that its lengths follow every preset.
+
     Raises:
         ConfigError: an unknown name, a value of the wrong type or out of range.
     """
     pairs = [split(argument) for argument in arguments]
     base = _read("base")
     chosen = {axis: str(dict(pairs).get(axis, base[axis])) for axis in ("preset", "ablation")}
-    layers = [base]
     for axis, name in chosen.items():
         if name not in names(axis):
             offer = nearest(name, names(axis))
             raise ConfigError(f"{axis}={brief(name)}: expected one of {', '.join(names(axis))}{offer}")
-        layers.append(_read(f"{axis}/{name}"))
+    preset, ablation = (_read(f"{axis}/{name}") for axis, name in chosen.items())
+    factors = _factors(f"conf/ablation/{chosen['ablation']}.yaml", ablation.pop("times", {}))
     settings = _schema(Config)
-    for key, value in [leaf for layer in layers for leaf in flatten(layer).items()] + pairs:
+    for key, value in (flatten(base) | flatten(preset)).items():
+        _set(settings, key, value)
+    for key, factor in factors.items():
+        _set(settings, key, _multiplied(key, OmegaConf.select(settings, key), factor))
+    for key, value in [*flatten(ablation).items(), *pairs]:
         _set(settings, key, value)
     return from_tree(OmegaConf.to_container(settings))
+
+
+def _factors(file: str, times: Any) -> dict[str, float]:
+    """What an ablation's block `times` multiplies, by the setting's dotted key.
+
+    Raises:
+        ConfigError: names the file; a setting that is none of SIZES, or a factor that is no number above 0.
+    """
+    if not isinstance(times, dict):
+        raise ConfigError(f"{file}: times: expected settings and what to multiply them by, found {brief(times)}")
+    factors, allowed = flatten(times), Range(above=0, high=1e9)
+    for key, factor in factors.items():
+        if key not in SIZES:
+            expected = f"expected one of {', '.join(SIZES)}{nearest(key, SIZES)}"
+            raise ConfigError(f"{file}: times.{brief(key)}={brief(factor)}: {expected}")
+        number = isinstance(factor, int | float) and not isinstance(factor, bool)
+        if not number or factor not in allowed:
+            raise ConfigError(f"{file}: times.{key}={brief(factor)}: expected a number {allowed}")
+    return factors
+
+
+def _multiplied(key: str, number: int, factor: float) -> int:
+    """A whole number times a factor, rounded, and at least what the setting takes."""
+    low = next(allowed.low for name, _, allowed in _fields() if name == key)
+    return max(int(low), round(number * factor))
 
 
 def from_tree(tree: Any) -> Config:
