@@ -140,6 +140,26 @@ def test_the_distances_are_those_between_the_robots(evaluation: Evaluation) -> N
         assert "workspace units" in axis.get_ylabel() or setting != "none"
 
 
+def test_what_counts_as_touching_is_drawn_where_samples_are_judged(
+    data: DemonstrationData, evaluation: Evaluation
+) -> None:
+    """With a radius of their own samples are judged, coloured and drawn by that one, and distances stay distances."""
+    flow, shown = model("sample.radius=0.2"), evaluation.samples["none"][: workspace.SHOWN]
+    nearest = distance(shown).amin(dim=1)
+    assert bool(((nearest > 0.2) & (nearest < 0.3)).any())
+    for axis in (workspace.distances(flow, evaluation).axes[0], figures.page(flow, data, evaluation).axes[5]):
+        drawn = [line for line in axis.lines if line.get_linestyle() == "-"]
+        found = torch.tensor(np.array([line.get_ydata() for line in drawn]))
+        torch.testing.assert_close(sort(found), sort(distance(shown)), rtol=0, atol=1e-6)  # float32
+        colliding = torch.tensor([line.get_color() == workspace.COLLISION for line in drawn])
+        assert torch.equal(colliding, found.amin(dim=1) < 0.2)
+        assert axis.lines[-1].get_ydata() == pytest.approx([0.2, 0.2])
+        assert [text.get_text() for text in axis.texts] == ["touching at 0.2"]
+    content = json.loads(animation(flow, evaluation, "").split("const content = ")[1].split(";\n")[0])
+    # The obstacle is met by the discs that its guidance knows.
+    assert [panel["radius"] for panel in content["scenes"][0]["panels"]] == [0.1, 0.1, 0.15]
+
+
 def test_methods_gives_every_run_a_row(evaluation: Evaluation) -> None:
     figure = workspace.methods([("first", model(), evaluation), ("second", model(), evaluation)])
     assert len(figure.axes) == 6

@@ -40,10 +40,14 @@ def fitted(settings: Config, demonstrations: Tensor) -> Config:
     return replace(settings, source=replace(settings.source, length_scale=length_scale, sigma_f=sigma_f))
 
 
+def judged_radius(settings: Config) -> float:
+    """The distance of two robots' centres below which samples count as robot collisions."""
+    return settings.sample.radius or settings.constraint.radius
+
+
 def judge(settings: Config, D: int) -> Constraint:
     """The constraint that samples are judged by."""
-    radius = settings.sample.radius or settings.constraint.radius
-    return RobotAvoidance(PointRobots(D // 2), radius, _barrier(settings.constraint))
+    return RobotAvoidance(PointRobots(D // 2), judged_radius(settings), _barrier(settings.constraint))
 
 
 def robot_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:

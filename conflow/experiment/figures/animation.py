@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from conflow.experiment.build import judged_radius
 from conflow.experiment.evaluation import Evaluation
 from conflow.experiment.figures.workspace import COLLISION, OBSTACLE, ROBOTS, TITLES
 from conflow.experiment.module import SETTINGS, ConFlow
@@ -21,13 +22,11 @@ def animation(model: ConFlow, evaluation: Evaluation, name: str) -> str:
 
     Up to two trajectories that collide without guidance and two that do not; all settings start from the same x_0.
     """
-    config = model.config
-    obstacle = config.sample.obstacle
+    obstacle = model.config.sample.obstacle
     violates = model.robots.violation(evaluation.samples["none"])
     chosen = [*violates.nonzero().flatten()[:EACH].tolist(), *(~violates).nonzero().flatten()[:EACH].tolist()]
     content = {
         "name": name,
-        "radius": config.constraint.radius,
         "obstacle": [obstacle.x, obstacle.y, obstacle.radius],
         "colours": {"robots": ROBOTS, "collision": COLLISION, "obstacle": OBSTACLE},
         "scenes": [
@@ -55,11 +54,12 @@ def frames(x: Tensor) -> Tensor:
 
 
 def _panel(model: ConFlow, x: Tensor, title: str, around_obstacle: bool) -> dict[str, Any]:
-    """One trajectory (1, T, D): each frame's positions, and its gaps to what touches at 0."""
+    """One trajectory (1, T, D): each frame's positions, the discs' radius, and the gaps to what touches at 0."""
     x = frames(x)
     return {
         "title": title,
         "aroundObstacle": around_obstacle,
+        "radius": (model.config.constraint.radius if around_obstacle else judged_radius(model.config)) / 2,
         "positions": _rounded(x[0].unflatten(1, (-1, 2))),
         "robotGap": _rounded(model.robots.clearance(x)[0]),
         "obstacleGap": _rounded(model.obstacle.clearance(x)[0]),

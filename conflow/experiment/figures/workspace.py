@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 from torch import Tensor
 
-from conflow.experiment.build import robot_avoidance
+from conflow.experiment.build import judged_radius, robot_avoidance
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import Evaluation
 from conflow.experiment.module import SETTINGS, ConFlow
@@ -61,7 +61,7 @@ def page(model: ConFlow, data: DemonstrationData, evaluation: Evaluation) -> Fig
     _judged(axes[1], evaluation.source_samples, model.robots, f"source: {config.source.kind}")
     _zoom_out(axes[1:2], evaluation.source_samples)
     _settings(axes[2:5], model, evaluation)
-    _distances(axes[5], evaluation.samples["none"], model.robots, config.constraint.radius)
+    _distances(axes[5], evaluation.samples["none"], model)
     axes[5].set_title("distance of the robots\nno guidance")
     _legend(figure, model.D // 2)
     figure.suptitle(f"{config.ablation}, seed {config.seed}, preset {config.preset}")
@@ -97,7 +97,7 @@ def distances(model: ConFlow, evaluation: Evaluation) -> Figure:
     figure = Figure(figsize=(10.8, 3.9), layout="constrained")
     for axis, setting in zip(figure.subplots(1, len(SETTINGS), sharey=True), SETTINGS, strict=True):
         x = evaluation.samples[setting]
-        _distances(axis, x, model.robots, model.config.constraint.radius)
+        _distances(axis, x, model)
         axis.set_title(f"{TITLES[setting]}\n{_share(model.robots.violation(x))} collide")
         axis.label_outer()
     handles = [
@@ -180,8 +180,9 @@ def _contacts(x: Tensor, constraint: Constraint) -> Tensor:
     return (x.unflatten(2, (-1, 2))[closest] * pushed).sum(dim=1) / pushed.sum(dim=1)
 
 
-def _distances(axis: Axes, x: Tensor, robots: Constraint, radius: float) -> None:
-    distance, violates = (robots.clearance(x) + radius)[:SHOWN], robots.violation(x)[:SHOWN]
+def _distances(axis: Axes, x: Tensor, model: ConFlow) -> None:
+    x, radius = x[:SHOWN], judged_radius(model.config)
+    distance, violates = model.robots.clearance(x) + radius, model.robots.violation(x)
     s = torch.linspace(0, 1, x.shape[1])
     for shown, colour in ((~violates, "#666666"), (violates, COLLISION)):
         axis.plot(s, distance[shown].T, color=colour, alpha=0.5, lw=0.9)
