@@ -1,4 +1,4 @@
-# What users type. Every target is one line over `python -m conflow`; `make help` lists them.
+# What users type. Every command of `python -m conflow` is a target of one line; `make help` lists them.
 
 ABLATION ?= cgp
 SEED     ?= 0

@@ -65,7 +65,7 @@ def evaluate(arguments: list[str]) -> None:
 
 
 def compare(arguments: list[str]) -> None:
-    """Print the paper's tables and claims from all finished runs of a preset, or, reference=1, those of record."""
+    """Print the paper's tables and claims from finished runs: preset=quick format=table; reference=1: published."""
     from conflow.experiment import compare, config, report
 
     options, settings = config.options(arguments, {"preset": "quick", "format": "table", "reference": "0"})
@@ -78,7 +78,7 @@ def compare(arguments: list[str]) -> None:
 
 
 def reference(arguments: list[str]) -> None:
-    """Write the numbers of all finished runs of a preset into runs/reference/runs/, a file each: preset=quick."""
+    """Write the numbers of a preset's newest finished runs into runs/reference/runs/, a file each: preset=quick."""
     from conflow.experiment import config
 
     options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
@@ -91,7 +91,7 @@ def reference(arguments: list[str]) -> None:
 
 
 def sample(arguments: list[str]) -> None:
-    """Plan from start= to goal= and write the plans and a picture: run=latest out=plans.npz num=64 obstacle=x,y,r."""
+    """Plan from start= to goal= and draw it: run=latest out=plans.npz num=64 seed=0 guidance=both obstacle=x,y,r."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
@@ -218,7 +218,9 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, function in COMMANDS.items():
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
-        command.add_argument("settings", nargs="*", metavar="key=value", help="settings, see conf/base.yaml")
+        command.add_argument(
+            "settings", nargs="*", metavar="key=value", help="options, or settings, see conf/base.yaml"
+        )
     arguments = parser.parse_args()
     try:
         COMMANDS[arguments.command](arguments.settings)
