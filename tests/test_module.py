@@ -167,9 +167,11 @@ def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not flow.sample(x_1, setting, noise()).requires_grad
 
 
-def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes() -> None:
-    """u_t = x_1 - x_0 + lambda t S grad C(x_t + (1 - t) v), by autograd, whatever M is, and v held fixed in it."""
-    flow = model("correction.at=end", "correction.smoothing=covariant", "correction.margin=0.05")
+@pytest.mark.parametrize("ramp", [1, 3])
+def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes(ramp: int) -> None:
+    """u_t = x_1 - x_0 + lambda t^ramp S grad C(x_t + (1 - t) v), by autograd, whatever M is, v held fixed in it."""
+    settings = ("correction.smoothing=covariant", "correction.margin=0.05", f"correction.ramp={ramp}")
+    flow = model("correction.at=end", *settings)
     x_1, draws = swap(300), noise()
     x_0 = flow.source.sample(x_1[:, [0, -1]], draws)
     t = torch.rand(300, generator=draws)
@@ -180,7 +182,7 @@ def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes
     C = -F.softplus(-10 * ((x_end[..., :2] - x_end[..., 2:]).norm(dim=-1) - 0.35)) / 10
     (g,) = torch.autograd.grad(C.sum(), x_end)
     Sigma = flow.source.covariance
-    target = x_1 - x_0 + 2.5 * s * ((Sigma / Sigma.sum(dim=1).max()).float() @ g)
+    target = x_1 - x_0 + 2.5 * s**ramp * ((Sigma / Sigma.sum(dim=1).max()).float() @ g)
     expected = ((v - target) ** 2).mean()
     for M in (torch.zeros(300, dtype=torch.bool), torch.ones(300, dtype=torch.bool)):
         # Single precision.

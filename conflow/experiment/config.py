@@ -125,6 +125,7 @@ class Correction:
     lambda_c: Weight
     mask: Mask
     at: Place
+    ramp: Annotated[float, Range(0, 100)]
     path: PathKind
     margin: Annotated[float, Range(0, 1)]
     walls: bool
@@ -509,6 +510,8 @@ def _check(config: Config) -> None:
         )
     if config.correction.at == "end" and config.correction.path == "guided":
         raise ConfigError("correction.path=guided: expected correction.at=point, the path is guided at its own points")
+    if config.correction.at != "end" and config.correction.ramp != 1:
+        raise ConfigError(f"correction.ramp={config.correction.ramp}: expected correction.at=end, which it belongs to")
     if config.data.negative_share is not None and (not config.data.negatives or config.data.repair):
         raise ConfigError(
             f"data.negative_share={config.data.negative_share}: expected data.negatives=true and data.repair=false"

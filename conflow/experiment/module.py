@@ -84,7 +84,7 @@ class ConFlow(LightningModule):
         v = self.v(x_t, t, ends)
         if self.config.correction.at == "end":
             # The barrier is its own mask: nothing to correct where the predicted end is feasible.
-            u_c = t[:, None, None] * self.u_c(end(x_t, v.detach(), t))
+            u_c = (t**self.config.correction.ramp)[:, None, None] * self.u_c(end(x_t, v.detach(), t))
         else:
             u_c = M[:, None, None] * self.u_c(x_t)
         return self.distance(v, velocity(x_0, x_1) + lambda_c * u_c)
