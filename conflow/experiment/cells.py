@@ -2,18 +2,14 @@
 
 import itertools
 import math
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
-from scipy import stats
-
-from conflow.experiment import paper
+from conflow.experiment import paper, seeds
 from conflow.experiment.metrics import wilson
 from conflow.experiment.record import Record
-
-LEVEL = 0.05
-"""Rates differ and claims are decided at this level, two-sided."""
+from conflow.experiment.seeds import Score, Seed
 
 METHODS = {
     "cgp": "ConFlow (D+ and D-)",
@@ -74,6 +70,10 @@ READINGS = {
     "none/smoothness_median": "smoothness, median",
     "none/start_error": "start error per robot",
 }
+Interval = tuple[float | None, float | None]
+NONE: Interval = (None, None)
+SHARED = "/energy_distance"
+"""Ends the metrics whose error the seeds share: they are measured against one sample of held-out D+."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +81,17 @@ class Cell:
     """One number of a table.
 
     Attributes:
-        value, low, high: of a rate the pooled one with Wilson's interval; else the mean over seeds, with the one that
-            follows from theirs.
+        value: of a rate that of all trajectories together, else the mean over seeds.
+        low, high: its interval over seeds, which is of the method; none where there is one seed alone. Without a
+            network every trajectory is independent, and it is the same as `within_low` and `within_high`.
+        within_low, within_high: the interval of these networks' own mean, which says nothing of others: Wilson's of a
+            rate, else the one that follows from theirs.
         seed_low, seed_high: the smallest and the largest of the seeds.
         count: trajectories that the rate counts, over all seeds, of a rate.
         trajectories: over all seeds.
         preset: the scale that it was measured at.
-        paper_p: of Fisher's exact test between this rate and the paper's.
+        differs: whether the paper's rate is another than one new network of this method would reach in as many
+            trajectories; none where that is not judged.
     """
 
     table: str
@@ -97,13 +101,15 @@ class Cell:
     value: float
     low: float | None
     high: float | None
+    within_low: float | None
+    within_high: float | None
     seed_low: float
     seed_high: float
     seeds: int
     count: int | None
     trajectories: int
     preset: str
-    paper_p: float | None
+    differs: bool | None
 
     @property
     def without_model(self) -> bool:
@@ -111,9 +117,9 @@ class Cell:
         return self.row.startswith(BASELINE)
 
     @property
-    def differs(self) -> bool:
-        """Whether this is another rate than the paper's."""
-        return self.paper_p is not None and self.paper_p < LEVEL
+    def interval(self) -> Interval:
+        """Over seeds, or of one seed within its network."""
+        return (self.low, self.high) if self.low is not None else (self.within_low, self.within_high)
 
 
 def tables(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> list[Cell]:
@@ -193,38 +199,57 @@ def cell(table: str, row: str, column: str, printed: float | None, metric: str, 
     """The number over the seeds of a row, beside the paper's, or None where a run lacks the metric."""
     if not runs or not _measured(metric, runs):
         return None
-    values, trajectories = per_seed(metric, runs), sum(_trajectories(metric, run) for run in runs)
-    value, count, paper_p = statistics.mean(values), None, None
-    if f"{metric}_count" not in runs[0].metrics:
-        low, high = _interval(value, metric, runs)
-    else:
-        count = sum(int(run.metrics[f"{metric}_count"]) for run in runs)
-        value = count / trajectories
-        low, high = wilson(count, trajectories)
-        if printed is not None and table == "1":
-            paper_p = fisher_p(count, trajectories, round(printed * paper.TRAJECTORIES), paper.TRAJECTORIES)
-    across = (min(values), max(values), len(runs), count, trajectories, runs[0].preset, paper_p)
-    return Cell(table, row, column, printed, value, low, high, *across)
+    count, value, over_seeds, within = (_rate if f"{metric}_count" in runs[0].metrics else _mean)(metric, runs)
+    low, high = within if row.startswith(BASELINE) else over_seeds
+    differs = None
+    if table == "1" and printed is not None and len(runs) > 1:
+        the_papers = Score.of_rate(round(printed * paper.TRAJECTORIES), paper.TRAJECTORIES)
+        differs = seeds.differs(list(scores(metric, runs).values()), the_papers)
+    values, trajectories = [_value(metric, run) for run in runs], sum(_trajectories(metric, run) for run in runs)
+    across = (min(values), max(values), len(runs), count, trajectories, runs[0].preset)
+    return Cell(table, row, column, printed, value, low, high, within[0], within[1], *across, differs)
 
 
-def _interval(value: float, metric: str, runs: Sequence[Record]) -> tuple[float | None, float | None]:
-    """Of a mean over seeds: the distances to the ends of the seeds' own intervals, as independent errors of a mean."""
+def _rate(metric: str, runs: Sequence[Record]) -> tuple[int, float, Interval, Interval]:
+    """The count of all trajectories, their rate, and its intervals over seeds and within these networks."""
+    counts = [int(run.metrics[f"{metric}_count"]) for run in runs]
+    totals = [_trajectories(metric, run) for run in runs]
+    count, total = sum(counts), sum(totals)
+    over_seeds = seeds.rate_interval(counts, totals) if len(runs) > 1 else NONE
+    return count, count / total, over_seeds, wilson(count, total)
+
+
+def _mean(metric: str, runs: Sequence[Record]) -> tuple[None, float, Interval, Interval]:
+    """No count, the mean over seeds, and its intervals over seeds and within these networks.
+
+    Errors of the runs add up in squares where they are independent; shared ones are as large in the mean as in each.
+    """
+    values, shared = [run.metrics[metric] for run in runs], metric.endswith(SHARED)
+    mean, below, above = fmean(values), 0.0, 0.0
     ends = [(run.metrics.get(f"{metric}_low"), run.metrics[metric], run.metrics.get(f"{metric}_high")) for run in runs]
     known = [(middle - low, high - middle) for low, middle, high in ends if low is not None and high is not None]
-    if len(known) < len(runs):
-        return None, None
-    below, above = (math.hypot(*distances) / len(runs) for distances in zip(*known, strict=True))
-    return value - below, value + above
+    if complete := len(known) == len(runs):
+        below, above = (fmean(one) if shared else math.hypot(*one) / len(one) for one in zip(*known, strict=True))
+    within = (mean - below, mean + above) if complete else NONE
+    if len(runs) == 1:
+        return None, mean, NONE, within
+    return None, mean, seeds.mean_interval(values, *((below, above) if shared else (0.0, 0.0))), within
 
 
-def per_seed(metric: str, runs: Sequence[Record]) -> list[float]:
-    """The metric of each run, a rate from its count."""
-    return [
-        run.metrics[f"{metric}_count"] / _trajectories(metric, run)
-        if f"{metric}_count" in run.metrics
-        else run.metrics[metric]
-        for run in runs
-    ]
+def scores(metric: str, runs: Sequence[Record]) -> dict[Seed, Score]:
+    """What each run reached, on the scale of the tests."""
+    return {(run.seed, run.origin.get("data_digest")): _score(metric, run) for run in runs}
+
+
+def _score(metric: str, run: Record) -> Score:
+    count = run.metrics.get(f"{metric}_count")
+    return Score(run.metrics[metric]) if count is None else Score.of_rate(count, _trajectories(metric, run))
+
+
+def _value(metric: str, run: Record) -> float:
+    """The metric of a run, a rate from its count."""
+    count = run.metrics.get(f"{metric}_count")
+    return run.metrics[metric] if count is None else count / _trajectories(metric, run)
 
 
 def _trajectories(metric: str, run: Record) -> int:
@@ -234,12 +259,6 @@ def _trajectories(metric: str, run: Record) -> int:
 def labels(runs: Sequence[Record]) -> list[str]:
     """The settings that runs were sampled with again."""
     return sorted({key.split("/")[1] for one in runs for key in one.metrics if key.startswith("evaluate/")})
-
-
-def fisher_p(count: int, trajectories: int, other_count: int, other_trajectories: int) -> float:
-    """The p of Fisher's exact test between two rates."""
-    table = [[count, trajectories - count], [other_count, other_trajectories - other_count]]
-    return float(stats.fisher_exact(table).pvalue)
 
 
 def digits(value: float) -> str:

@@ -1,24 +1,15 @@
 """The paper's claims, and ours, in words: what the runs say to each."""
 
-import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from scipy import stats
-
-from conflow.experiment.cells import COLLISIONS, LEVEL, QUALITIES, cell, digits, fisher_p, per_seed
+from conflow.experiment import seeds
+from conflow.experiment.cells import COLLISIONS, QUALITIES, cell, digits, scores
 from conflow.experiment.record import Record
+from conflow.experiment.seeds import LEVEL, Difference
 
-Verdict = Literal[
-    "holds",
-    "reversed",
-    "holds for these networks",
-    "reversed for these networks",
-    "not distinguishable",
-    "too few seeds",
-    "no runs",
-]
+Verdict = Literal["holds", "reversed", "not distinguishable", "too few seeds", "no runs"]
 
 
 @dataclass(frozen=True)
@@ -26,16 +17,18 @@ class Claim:
     """A sentence "a is lower than b", and what the runs say to it.
 
     Attributes:
-        verdict: of a rate by Fisher's exact test on the counts, "for these networks" where the test between seeds does
-            not say the same; of anything else by the test between seeds.
-        p: of Fisher's exact test, of a rate. It speaks of the networks that were trained, not of others.
-        seeds_p: of Welch's t test on the values of the seeds; none where there are too few to have a spread.
+        verdict: by the corrected p.
+        p: of the t test between seeds, in pairs where two seeds or more are common; none where it cannot be made.
+        corrected_p: by Holm's correction for all claims that are printed together.
+        unseen: where not distinguishable, the least difference that would have been seen, at the spread of these
+            seeds and with that correction.
     """
 
     text: str
     verdict: Verdict
     p: float | None
-    seeds_p: float | None
+    corrected_p: float | None
+    unseen: float | None
     detail: str
 
 
@@ -59,49 +52,44 @@ def claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
         ("plus collides less than ConFlow, without guidance", "plus", "cgp", none),
         ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
     ]
-    return [
-        *(_compare(runs, *claim) for claim in rates),
-        *(_compare(runs, f"CGP beats Gaussian: {row}", "cgp", "gaussian", key) for key, row in others),
-        *(_compare(runs, *claim) for claim in ours),
-    ]
+    ordered = [*rates, *((f"CGP beats Gaussian: {row}", "cgp", "gaussian", key) for key, row in others), *ours]
+    return _judged([_compared(runs, *claim) for claim in ordered])
 
 
-def _compare(runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str) -> Claim:
+def _compared(
+    runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str
+) -> tuple[Claim, Difference | None, bool]:
+    """A claim as it is before the test, the difference that decides it, if any, and whether that is of rates."""
     if lower not in runs or higher not in runs:
         missing = " and ".join(name for name in (lower, higher) if name not in runs)
-        return Claim(text, "no runs", None, None, f"no finished run of {missing}")
+        return _undecided(text, "no runs", f"no finished run of {missing}"), None, False
     a, b = (cell("", "", "", None, metric, runs[name]) for name in (lower, higher))
     if a is None or b is None:
-        return Claim(text, "no runs", None, None, f"not all runs of {lower} and {higher} have {metric}")
-    seeds_p = _welch_p(per_seed(metric, runs[lower]), per_seed(metric, runs[higher]))
-    p = None
-    if a.count is not None and b.count is not None:
-        p = fisher_p(a.count, a.trajectories, b.count, b.trajectories)
+        return _undecided(text, "no runs", f"not all runs of {lower} and {higher} have {metric}"), None, False
+    between = seeds.difference(scores(metric, runs[lower]), scores(metric, runs[higher]))
     detail = f"{digits(a.value)} against {digits(b.value)}, {a.seeds} and {b.seeds} seeds"
-    return Claim(text, _verdict(a.value < b.value, p, seeds_p), p, seeds_p, detail)
+    if between is not None and between.pairs:
+        detail += f", {between.pairs} in pairs"
+    return _undecided(text, "too few seeds", detail), between, a.count is not None
 
 
-def _verdict(lower: bool, p: float | None, seeds_p: float | None) -> Verdict:
-    """On "a is lower than b", where it is or is not.
-
-    Args:
-        lower: whether a's value is.
-        p: of the exact test, of a rate.
-        seeds_p: of the test between seeds, unless there are too few.
-    """
-    deciding = seeds_p if p is None else p
-    if deciding is None:
-        return "too few seeds"
-    if deciding >= LEVEL:
-        return "not distinguishable"
-    if seeds_p is None or seeds_p >= LEVEL:
-        return "holds for these networks" if lower else "reversed for these networks"
-    return "holds" if lower else "reversed"
+def _undecided(text: str, verdict: Verdict, detail: str) -> Claim:
+    return Claim(text, verdict, None, None, None, detail)
 
 
-def _welch_p(a: Sequence[float], b: Sequence[float]) -> float | None:
-    """The p of Welch's t test, or None where one side is a single value or neither has a spread."""
-    if min(len(a), len(b)) < 2 or len(set(a)) == len(set(b)) == 1:
-        return None
-    moments = [moment for side in (a, b) for moment in (statistics.mean(side), statistics.stdev(side), len(side))]
-    return float(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue)
+def _judged(compared: Sequence[tuple[Claim, Difference | None, bool]]) -> list[Claim]:
+    """The claims with their verdicts, corrected for all that are tested."""
+    tested = [i for i, (_, between, _) in enumerate(compared) if between is not None]
+    ps = [between.p for _, between, _ in compared if between is not None]
+    corrected = seeds.holm(ps)
+    # What Holm asks of the smallest p that it does not reject, and so of all that are not.
+    level = LEVEL / max(1, sum(p >= LEVEL for p in corrected))
+    judged = [claim for claim, _, _ in compared]
+    for i, p, corrected_p in zip(tested, ps, corrected, strict=True):
+        claim, between, of_rates = compared[i]
+        assert between is not None
+        seen = corrected_p < LEVEL
+        verdict: Verdict = "not distinguishable" if not seen else "holds" if between.a < between.b else "reversed"
+        unseen = None if seen else between.visible_rate(level) if of_rates else between.visible(level)
+        judged[i] = replace(claim, verdict=verdict, p=p, corrected_p=corrected_p, unseen=unseen)
+    return judged

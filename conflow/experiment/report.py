@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell, digits
+from conflow.experiment.claims import Claim
 from conflow.experiment.compare import Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.evaluation import Metrics
@@ -21,6 +22,14 @@ Format = Literal["table", "markdown", "csv", "json"]
 Sheet = tuple[str, list[str], list[list[str]]]
 """Title, header and rows of a table, as text."""
 
+NOTE = """\
+In brackets 95 % intervals. Over several seeds they are of the method: they say where the mean of many more networks
+lies, and take in by how much the seeds differ. "Within this network" they are of the one that was trained alone.
+"Differs": the paper's rate is not one that a new network of this method would reach in 256 trajectories, at 5 %.
+Claims are decided at 5 % by a t test between seeds, in pairs where they share seed and demonstrations; the corrected p
+(Holm's) allows for all claims of a table. "Not seen" is a difference that these seeds are too few, or too far apart, to
+show after that correction.
+"""
 ROWS = {
     "robot_collision_rate": "robot-collision rate",
     "object_collision_rate": "object-collision rate",
@@ -57,9 +66,9 @@ def _result(metrics: Metrics, key: str) -> str:
     return f"{digits(metrics[key])}\n[dim]\\[{digits(low)}, {digits(high)}][/dim]"
 
 
-def _estimate(value: float, low: float | None, high: float | None) -> str:
+def _estimate(value: float, low: float | None, high: float | None, where: str = "") -> str:
     """The value and, where there is one, its interval."""
-    return digits(value) if low is None or high is None else f"{digits(value)} [{digits(low)}, {digits(high)}]"
+    return digits(value) if low is None or high is None else f"{digits(value)}{where} [{digits(low)}, {digits(high)}]"
 
 
 def checked_format(name: str) -> Format:
@@ -87,6 +96,7 @@ def render(comparisons: Sequence[Comparison], form: Format, console: Console) ->
             console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
         if len(comparisons) > 1:
             _print_sheets([_overview(comparisons)], form, console)
+        console.out(NOTE, highlight=False)
 
 
 def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> None:
@@ -136,8 +146,7 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
 
 
 def _rate(cell: Cell) -> str:
-    estimate = _estimate(cell.value, cell.low, cell.high)
-    return f"{estimate}\n{cell.count} of {cell.trajectories}, {_seeds(cell)}"
+    return f"{_mean(cell)}\n{_count(cell)}, {_seeds(cell)}"
 
 
 def _size(cell: Cell) -> str:
@@ -157,8 +166,8 @@ def _sheets(comparison: Comparison) -> list[Sheet]:
         _methods_down(comparison, "4", "Table 4: what the paper leaves open, changed one at a time", READINGS),
         (
             "Claims, the paper's first",
-            ["claim", "verdict", "exact test on the counts", "t test between seeds", "values"],
-            [[one.text, one.verdict, _p(one.p), _p(one.seeds_p), one.detail] for one in comparison.claims],
+            ["claim", "verdict", "p", "corrected p", "values"],
+            [[one.text, _verdict(one), _p(one.p), _p(one.corrected_p), one.detail] for one in comparison.claims],
         ),
         (
             "Where Table 1 differs from the paper's",
@@ -200,10 +209,13 @@ def _cells(comparison: Comparison, number: str) -> dict[tuple[str, str], Cell]:
     return {(cell.row, cell.column): cell for cell in comparison.cells if cell.table == number}
 
 
+def _verdict(claim: Claim) -> str:
+    unseen = "" if claim.unseen is None else f", differences below {claim.unseen:.2g} are not seen"
+    return f"{claim.verdict}{unseen}"
+
+
 def _p(p: float | None) -> str:
-    if p is None:
-        return ""
-    return f"p = {p:.2g}" if p > 0 else "p < 1e-300"
+    return "" if p is None else f"{p:.2g}"
 
 
 def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
@@ -213,15 +225,28 @@ def _ordered(names: Iterable[str], metrics: Iterable[str]) -> list[str]:
 
 
 def _text(cell: Cell) -> str:
-    parts = [_estimate(cell.value, cell.low, cell.high)]
-    if cell.count is not None:
-        parts.append(f"{cell.count} of {cell.trajectories}")
-    if cell.seeds > 1:
-        parts.append(f"seeds {digits(cell.seed_low)} to {digits(cell.seed_high)}")
+    seeds = f"seeds {digits(cell.seed_low)} to {digits(cell.seed_high)}" if cell.seeds > 1 else ""
+    parts = [_mean(cell), ", ".join(part for part in (_count(cell), seeds) if part)]
     if cell.paper is not None:
-        agrees = "" if cell.paper_p is None else ", differs" if cell.differs else ", not distinguishable"
-        parts.append(f"paper {cell.paper:.4g}{agrees}")
-    return "\n".join(parts)
+        parts.append(f"paper {cell.paper:.4g}{_agreement(cell)}")
+    return "\n".join(part for part in parts if part)
+
+
+def _mean(cell: Cell) -> str:
+    """The value and its interval, which of one seed says nothing of others."""
+    where = ", within this network" if cell.low is None and cell.within_low is not None else ""
+    return _estimate(cell.value, *cell.interval, where)
+
+
+def _count(cell: Cell) -> str:
+    return "" if cell.count is None else f"{cell.count} of {cell.trajectories}"
+
+
+def _agreement(cell: Cell) -> str:
+    """What is said of the paper's rate; other numbers of the paper are not judged."""
+    if cell.differs is None:
+        return ", one seed: not judged" if cell.table == "1" else ""
+    return ", differs" if cell.differs else ", not distinguishable"
 
 
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

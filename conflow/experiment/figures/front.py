@@ -19,6 +19,7 @@ MARKERS = "osD^vP*X<>pdh8"
 def front(comparisons: Sequence[Comparison]) -> Figure:
     """Unguided robot collisions, with 95 % intervals, against the energy distance to held-out D+.
 
+    Intervals are over seeds; of one seed, within its network.
     A point for each method and preset, over its seeds, and a line from one preset of a method to the other: the
     nearer to the lower left the better.
     """
@@ -30,9 +31,10 @@ def front(comparisons: Sequence[Comparison]) -> Figure:
         line = zip(*((distance.value, rate.value) for distance, rate in points.values()), strict=True)
         axis.plot(*line, color=colour, lw=0.8, alpha=0.5)
         for preset, (distance, rate) in points.items():
-            assert rate.low is not None
-            assert rate.high is not None
-            spread = ([rate.value - rate.low], [rate.high - rate.value])
+            low, high = rate.interval
+            assert low is not None
+            assert high is not None
+            spread = ([rate.value - low], [high - rate.value])
             look: dict[str, Any] = {
                 "color": colour,
                 "marker": MARKERS[presets.index(preset)],
