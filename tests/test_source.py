@@ -1,7 +1,8 @@
 """The source against Gaussian conditioning done in other ways: by precision matrices, by GPyTorch, by SciPy."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import gpytorch
 import pytest
@@ -10,8 +11,9 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from conflow.flow import source
+from conflow.flow.correction import gaussian_filter
 from conflow.flow.source import ENDPOINTS, Source, fit_rbf, rbf
-from conflow.scene.trajectories import swap
+from conflow.scene.trajectories import passing, social, swap
 
 T, D = 8, 2
 
@@ -252,6 +254,71 @@ def test_what_is_no_gaussian_is_refused(K: Tensor, index: Sequence[int], noise: 
     """A ValueError says what was expected."""
     with pytest.raises(ValueError, match=reason):
         Source(K, index, noise)
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def constants() -> dict[str, Tensor]:
+    # From 64 waypoints on, eigenvectors of two threads differ from those of one.
+    length_scale, sigma_f = fit_rbf(swap(50), ENDPOINTS)
+    return source.cgp(64).state_dict() | {
+        "filter": gaussian_filter(64, width=33),
+        "fit": torch.tensor([length_scale, sigma_f], dtype=torch.float64),
+        "swap": swap(50, T=64),
+        "passing": passing(50, T=64),
+        "social": social(50, T=64),
+    }
+
+
+def test_constants_have_the_same_bits_for_every_number_of_threads() -> None:
+    """They are computed on one thread, and the caller's number is left as it was."""
+    with threads(1):
+        alone = constants()
+    with threads(2):
+        together = constants()
+        assert torch.get_num_threads() == 2
+    assert [name for name in alone if not torch.equal(alone[name], together[name])] == []
+
+
+def test_a_second_thread_of_less_accuracy_changes_no_constant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a busy machine, where half of an `exp` shared by two threads was off by 4.5e-10."""
+    expected = constants()
+
+    def careless(accurate: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+        def function(x: Tensor) -> Tensor:
+            error = torch.zeros(x.numel(), dtype=x.dtype)
+            error[x.numel() // 2 :] = 4.5e-10 * (torch.get_num_threads() > 1)
+            return accurate(x) * (1 + error.view_as(x))
+
+        return function
+
+    for name in ("exp", "sin", "cos"):
+        for owner in (torch, Tensor):
+            monkeypatch.setattr(owner, name, careless(getattr(owner, name)))
+    with threads(2):
+        built = constants()
+    assert [name for name in expected if not torch.equal(expected[name], built[name])] == []
+
+
+def test_a_kernel_that_is_symmetric_to_rounding_is_symmetric() -> None:
+    """No arithmetic promises more; the source's own matrices are symmetric to the last bit."""
+    K = rbf(T, 0.4, 1.0, 1e-3)
+    rounded = K * (1 + 4.5e-10 * torch.ones(T, T, dtype=torch.float64).triu(1))
+    assert not torch.equal(rounded, rounded.mT)
+    built = Source(rounded, ENDPOINTS)
+    assert torch.equal(built.prior, built.prior.mT)
+    # Half of the asymmetry, times the 1e3 that W may amplify it by.
+    torch.testing.assert_close(built.covariance, Source(K, ENDPOINTS).covariance, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="expected a finite symmetric matrix"):
+        Source(K + 1e-6 * torch.ones(T, T).triu(1))
 
 
 def test_a_saved_source_draws_the_same_samples_when_reloaded() -> None:

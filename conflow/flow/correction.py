@@ -5,6 +5,8 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor, nn
 
+from conflow.flow.threads import one_thread
+
 Edges = Literal["zero", "nearest", "normalised"]
 
 
@@ -45,6 +47,7 @@ class Correction(nn.Module):
         return (self.constraint.gradient(x).mT @ self.smoothing.mT).mT
 
 
+@one_thread()
 def gaussian_filter(T: int, sigma: float = 5.0, width: int = 9, edges: Edges = "zero") -> Tensor:
     """The Gaussian filter along the trajectory as a matrix, float64 (T, T).
 
@@ -64,6 +67,7 @@ def gaussian_filter(T: int, sigma: float = 5.0, width: int = 9, edges: Edges = "
     return torch.zeros(T, T, dtype=w.dtype).scatter_add(1, j.clamp(0, T - 1), w)
 
 
+@one_thread()
 def covariant(Sigma: Tensor) -> Tensor:
     """The source's covariance as the smoothing matrix, float64 (T, T): S = Sigma / max_i sum_j |Sigma_ij|.
 

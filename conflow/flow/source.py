@@ -10,11 +10,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from conflow.flow.threads import one_thread
+
 ENDPOINTS = (0, -1)
 LONGEST = 10.0
 """Largest length scale that a fit returns: straight demonstrations would push it to infinity."""
 SMALLEST = 1e-6
 """Smallest parameter that a fit returns: white noise would push the length scale to zero, still ones sigma_f."""
+ROUNDING = 1e-8
+"""Asymmetry of a covariance, relative to its largest entry, that is taken for rounding."""
 
 
 class Source(nn.Module):
@@ -48,6 +52,7 @@ class Source(nn.Module):
     variance: Tensor
     sampling_map: Tensor
 
+    @one_thread()
     def __init__(
         self, K: Tensor, index: Sequence[int] = (), noise: Sequence[float] = (), modes: int | None = None
     ) -> None:
@@ -55,6 +60,7 @@ class Source(nn.Module):
         self.kept = modes
         K = K.double()
         _check_covariance(K)
+        K = (K + K.mT) / 2
         observed, R = _observations(len(K), index, noise)
         try:
             W = torch.linalg.solve(K[observed][:, observed] + R.diag(), K[observed]).mT
@@ -69,7 +75,7 @@ class Source(nn.Module):
         Sigma[:, exact] = 0
         Sigma = (Sigma + Sigma.mT) / 2
         E, variance = _eigenvectors(Sigma, exact, modes)
-        self.register_buffer("prior", K.clone())
+        self.register_buffer("prior", K)
         self.register_buffer("index", observed)
         self.register_buffer("mean_map", W)
         self.register_buffer("covariance", Sigma if modes is None else E * variance @ E.mT)
@@ -101,6 +107,7 @@ class Source(nn.Module):
         return (torch.cat([y.mT, z], dim=-1) @ self.sampling_map.mT).mT
 
 
+@one_thread()
 def rbf(T: int, length_scale: float | Tensor, sigma_f: float | Tensor, epsilon: float) -> Tensor:
     """K_ij = sigma_f^2 exp(-(s_i - s_j)^2 / (2 l^2)) + epsilon delta_ij with s_i = i / (T - 1), float64 (T, T)."""
     s = torch.linspace(0, 1, T, dtype=torch.float64)
@@ -127,6 +134,7 @@ def cgp(
     return Source(rbf(T, length_scale, sigma_f, epsilon), ENDPOINTS, modes=modes)
 
 
+@one_thread()
 def fit_rbf(x: Tensor, index: Sequence[int] = (), epsilon: float = 1e-6) -> tuple[float, float]:
     """Maximum-likelihood (length_scale, sigma_f) of the source conditioned at `index`, for demonstrations x.
 
@@ -178,7 +186,7 @@ def fit_rbf(x: Tensor, index: Sequence[int] = (), epsilon: float = 1e-6) -> tupl
 
 
 def _check_covariance(K: Tensor) -> None:
-    if not bool(torch.isfinite(K).all()) or not torch.equal(K, K.mT):
+    if not bool(torch.isfinite(K).all()) or not torch.allclose(K, K.mT, rtol=0, atol=ROUNDING * float(K.abs().max())):
         raise ValueError("covariance: expected a finite symmetric matrix")
     # Rounding alone makes the smallest eigenvalue of a smooth kernel negative, by some 1e-16 of the trace.
     if bool((torch.linalg.eigvalsh(K) < -1e-9 * K.diagonal().abs().sum()).any()):

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -65,7 +66,9 @@ def walk(robots: Robots, T: int, radius: float) -> tuple[Tensor, Tensor]:
 def _acceleration(robots: Robots, position: Tensor, velocity: Tensor, radius: float) -> Tensor:
     ahead, to_go = _direction(robots.goal - position)
     left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=2)
-    heading = robots.drift.cos()[..., None] * ahead + robots.drift.sin()[..., None] * left
+    # NumPy's cos, sin and exp, here and below: of two threads that share torch's one may be less accurate.
+    cos, sin = (torch.from_numpy(function(robots.drift.numpy()))[..., None] for function in (np.cos, np.sin))
+    heading = cos * ahead + sin * left
     desired = torch.minimum(robots.speed[..., None], to_go / BRAKING) * heading
 
     away, distance = _direction(position - position.flip(1))
@@ -83,7 +86,7 @@ def _direction(v: Tensor) -> tuple[Tensor, Tensor]:
 
 def _force(strength: Tensor, reach: Tensor, depth: Tensor) -> Tensor:
     """A exp(depth / B), (num, 2, 1), no more than A e: robots that overlap do not fly apart."""
-    return strength[..., None] * (depth / reach[..., None]).clamp(max=1).exp()
+    return strength[..., None] * torch.from_numpy(np.exp((depth / reach[..., None]).clamp(max=1).numpy()))
 
 
 def _resampled(path: Tensor, end: Tensor, T: int) -> Tensor:

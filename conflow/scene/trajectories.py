@@ -75,7 +75,8 @@ def passing(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor
     w = 0.3 + 0.05 * _uniform(generator, num, 2, 1).double()
     share = 0.5 + 0.2 * _uniform(generator, num, 1, 1).double() * torch.tensor([[1.0], [-1.0]])
     side = torch.where(_some(0.65, num, generator), -1.0, 1.0)[:, None, None]
-    bump = side * share * (1 + torch.cos(torch.pi * ((s - c) / w).clamp(-1, 1))) / 2
+    # NumPy's cos and sin, here and below: of two threads that share torch's one may be less accurate.
+    bump = side * share * (1 + torch.from_numpy(np.cos((torch.pi * ((s - c) / w).clamp(-1, 1)).numpy()))) / 2
     bend = _trajectories(p, q, s, bump) - straight
 
     def bent(h: Tensor) -> Tensor:
@@ -147,7 +148,7 @@ def _ends(num: int, jitter: float, generator: torch.Generator) -> tuple[Tensor, 
 def _harmonics(count: int, T: int) -> Tensor:
     """sin(k pi s) for k = 1, ..., count, (count, T), zero at both ends."""
     s = torch.linspace(0, 1, T, dtype=torch.float64)
-    harmonics = torch.sin(torch.pi * torch.arange(1, count + 1)[:, None] * s)
+    harmonics = torch.from_numpy(np.sin((torch.pi * torch.arange(1, count + 1)[:, None] * s).numpy()))
     harmonics[:, -1] = 0  # sin(k pi) in floating point is not
     return harmonics
 
