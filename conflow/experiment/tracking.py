@@ -66,8 +66,10 @@ def client() -> MlflowClient:
     local = store_uri() == local_uri()
     # A server decides itself where artifacts go.
     artifacts = None if store_uri().startswith("http") else (RUNS / "artifacts").absolute().as_uri()
-    # Two processes that migrate a new SQLite file at once break it, and so does one that is interrupted.
+    # Two processes that migrate a new SQLite file at once break it.
     with FileLock(RUNS / ".store.lock"), whole():
+        if local and not (RUNS / "mlflow.db").exists():
+            _make_store()
         store = MlflowClient(store_uri())
         experiment = store.get_experiment_by_name(EXPERIMENT)
         if experiment is None:
@@ -125,6 +127,15 @@ def _check_reachable(uri: str) -> None:
         place = f"{server.scheme}://{server.netloc.rpartition('@')[2]}"  # without the password
         found = getattr(error, "strerror", None) or error
         raise ConfigError(f"MLFLOW_TRACKING_URI={place}: {found}, expected a server of MLflow that answers") from None
+
+
+def _make_store() -> None:
+    """A new SQLite file with all its tables, which has its name only when it is whole, however the process ends."""
+    made = RUNS / "mlflow.db.new"
+    for left in RUNS.glob(f"{made.name}*"):  # by one that was killed
+        left.unlink()
+    MlflowClient(f"sqlite:///{made.absolute()}").search_experiments(max_results=1)
+    made.rename(RUNS / "mlflow.db")
 
 
 def _create_experiment(store: MlflowClient, artifacts: str | None) -> None:

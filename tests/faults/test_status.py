@@ -23,6 +23,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_process_that_dies_while_it_makes_the_store_leaves_none_that_is_half_made(tmp_path: Path) -> None:
+    """Half of the tables would be refused by every later command, which makes them all instead."""
+    death = killed_in("alembic.runtime.migration", "HeadMaintainer.update_to_step")
+    assert processes.run(tmp_path, "compare", "preset=smoke", death=death)[0] == -signal.SIGKILL
+    code, output = processes.run(tmp_path, "compare", "preset=smoke")
+    assert code == 2, output
+    assert "no run at this preset has finished" in output
+    assert runs(tmp_path) == []
+    assert [path.name for path in (tmp_path / "runs").glob("*mlflow*")] == ["mlflow.db"]
+
+
 def status(folder: Path, name: str) -> str:
     return next((str(run.info.status) for run in runs(folder) if run.info.run_name == name), "none")
 
