@@ -1,17 +1,23 @@
 """What an evaluation holds, and the comparison of demonstrations with their own feasible part."""
 
 import io
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 import torch
+from lightning.pytorch.loggers import Logger
 from rich.console import Console
 from torch import Tensor
 
 from conflow.experiment import config, report
-from conflow.experiment.datamodule import Split
+from conflow.experiment.datamodule import DemonstrationData, Split
 from conflow.experiment.evaluation import Evaluation, evaluate
 from conflow.experiment.module import SETTINGS, ConFlow
 from conflow.experiment.progress import ProgressDisplay
+from conflow.experiment.train import trainer
+from conflow.scene.constraint import RobotAvoidance
+from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import swap
 
 
@@ -29,6 +35,46 @@ def evaluated(demonstrations: Tensor, M: Tensor | None = None) -> Evaluation:
 @pytest.fixture(scope="module")
 def evaluation() -> Evaluation:
     return evaluated(swap(200))
+
+
+class Differentiated(RobotAvoidance):
+    """A constraint without a gradient in closed form."""
+
+    def gradient(self, x: Tensor) -> Tensor:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            return torch.autograd.grad(self.barrier(x).sum(), x)[0]
+
+
+class Silent(Logger):
+    """A logger that keeps nothing."""
+
+    name = version = run_id = "silent"
+
+    def log_metrics(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def log_hyperparams(self, *_: Any, **__: Any) -> None:
+        pass
+
+
+def test_a_gradient_that_autograd_takes_serves_as_well_as_one_in_closed_form(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In training, validation and evaluation; both gradients are the same to rounding."""
+    monkeypatch.chdir(tmp_path)
+    settings = config.load(["preset=smoke", "train.max_steps=4", "train.val_every=2", "sample.num=8", "sample.steps=4"])
+    data = DemonstrationData(settings)
+    results = []
+    for avoidance in (Differentiated, RobotAvoidance):
+        torch.manual_seed(0)
+        flow = ConFlow(settings, data.T, data.D)
+        flow.u_c.constraint = avoidance(PointRobots(2))
+        with ProgressDisplay(Console(file=io.StringIO())) as display:
+            trainer(settings, cast(Any, Silent()), data, display).fit(flow, data)
+            results.append(evaluate(flow.eval(), data.test, display).samples)
+    # Single precision, through a few steps of training.
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-4)
 
 
 def violates(x: Tensor) -> Tensor:

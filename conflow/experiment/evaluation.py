@@ -43,7 +43,7 @@ class Evaluation:
         return {f"{group}/{name}": value for group, metrics in groups.items() for name, value in metrics.items()}
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def evaluate(model: ConFlow, split: Split, display: ProgressDisplay) -> Evaluation:
     """Sample `sample.num` trajectories under every setting and measure them.
 
