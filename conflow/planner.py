@@ -6,7 +6,7 @@
 
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from numbers import Integral, Real
 from pathlib import Path
@@ -31,7 +31,7 @@ from conflow.experiment.metrics import leaves_workspace, smoothness, wilson
 from conflow.experiment.module import ConFlow, start_and_goal
 from conflow.experiment.tracking import artifact, find_run
 from conflow.flow.correction import Correction
-from conflow.flow.sampler import Field, integrate
+from conflow.flow.sampler import Field, in_pieces, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, Obstacle, Sum
 
@@ -111,7 +111,7 @@ class Planner:
         robot_weight: float | None = None,
         obstacle_weight: float | None = None,
     ) -> Plans:
-        """`num` trajectories x_1 for every pair of start and goal, all in one batch through the network.
+        """`num` trajectories x_1 for every pair of start and goal.
 
         x_0 ~ p(. | y), the run's source conditioned on y = (start, via-points, goal); x_1 is where the guided flow
         v + lambda_r u^c_robots + lambda_o u^c_obstacles takes it. Then `exact` makes it meet y to the last bit, and
@@ -152,17 +152,20 @@ class Planner:
         y = torch.stack([start, *(point.expand_as(start) for point in points.values()), goal], dim=-2)
         y = y.reshape(-1, *y.shape[-2:])
         self._check_memory(num, len(y))
-        ends = start_and_goal(y).repeat_interleave(num, dim=0)
-        v = self._field(ends, guidance, discs, robot_weight, obstacle_weight)
-        x = self._sample(v, y, (0, *points, -1), num, seed)
+        sample = self.model.config.sample
+
+        def arrive(x_0: Tensor, ends: Tensor) -> Tensor:
+            v = self._field(ends, guidance, discs, robot_weight, obstacle_weight)
+            return integrate(v, x_0, sample.steps, sample.solver)
+
+        x = self._sample(arrive, y, (0, *points, -1), num, seed)
         plans = _ranked(x, constraint)
         return plans if start.ndim == 2 else plans[0]
 
     def _check_memory(self, num: int, pairs: int) -> None:
-        """Refuse more plans than fit into memory: x_0, x_t, v and the step of each, and two layers of the network."""
-        floats = 4 * self.model.T * self.model.D + 2 * self.model.config.network.hidden
+        """Refuse more plans than fit into memory: x_0, x_1, what is missing of y, and the result."""
         try:
-            check_memory("num", num, 4 * num * pairs * floats)
+            check_memory("num", num, 4 * 4 * num * pairs * self.model.T * self.model.D)
         except ConfigError as error:
             raise PlanError(str(error)) from None
 
@@ -200,16 +203,21 @@ class Planner:
             replace(settings, sample=replace(settings.sample, obstacle=disc)), self.model.D, margin
         )
 
-    def _sample(self, v: Field, y: Tensor, index: Sequence[int], num: int, seed: int) -> Tensor:
-        """`num` trajectories for each row of y (B, O, D), which they meet at the waypoints `index`: (B, num, T, D)."""
+    def _sample(
+        self, arrive: Callable[[Tensor, Tensor], Tensor], y: Tensor, index: Sequence[int], num: int, seed: int
+    ) -> Tensor:
+        """`num` trajectories for each row of y (B, O, D), which they meet at the waypoints `index`: (B, num, T, D).
+
+        `arrive` takes samples x_0 of the source to x_1, for their starts and goals.
+        """
         try:
             source = self.model.source.condition(index)
         except ValueError as error:
             raise PlanError(f"via: {error}") from None
         # Each pair's own draws, so that they do not depend on the other pairs.
         x_0 = torch.cat([source.sample(pair.expand(num, -1, -1), random_stream("plan", seed)) for pair in y])
-        x_1 = integrate(v, x_0, self.model.config.sample.steps, self.model.config.sample.solver)
-        return exact(source, x_1, y.repeat_interleave(num, dim=0)).unflatten(0, (len(y), num))
+        y = y.repeat_interleave(num, dim=0)
+        return exact(source, in_pieces(arrive, x_0, start_and_goal(y)), y).unflatten(0, (-1, num))
 
 
 def exact(source: Source, x: Tensor, y: Tensor) -> Tensor:

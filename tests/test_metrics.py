@@ -226,6 +226,7 @@ def test_pairs_are_the_same_where_rows_come_in_chunks(monkeypatch: pytest.Monkey
     diversity.update(x)
     whole = energy(x, y) | diversity.compute()
     monkeypatch.setattr(metrics_module, "PAIR_ROWS", 7)
+    monkeypatch.setattr(metrics_module, "PAIR_COLUMNS", 11)
     diversity = Diversity()
     diversity.update(x)
     assert energy(x, y) | diversity.compute() == pytest.approx(whole, abs=1e-8)

@@ -11,7 +11,7 @@ from conflow.experiment.metrics import smoothness
 from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import guided_path, interpolate
-from conflow.flow.sampler import integrate
+from conflow.flow.sampler import PIECE, integrate
 from conflow.flow.source import ENDPOINTS, fit_rbf
 from conflow.scene.trajectories import swap
 
@@ -153,6 +153,22 @@ def test_a_fitted_kernel_comes_from_the_demonstrations_and_survives_reloading() 
 
 def test_without_fit_the_kernel_stays_as_it_is_set(smoke: Config) -> None:
     assert fitted(smoke, swap(200)) is smoke
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_samples_do_not_depend_on_how_many_are_asked_for(setting: Setting) -> None:
+    """Nor does what the network sees at a time grow with them; the same again is the same to the last bit."""
+    flow = model("network.sees_ends=true", "sample.steps=2")
+    seen: list[int] = []
+    flow.v.register_forward_hook(lambda _, inputs, __: seen.append(len(inputs[0])))
+    x_1 = swap(2 * PIECE + 100)
+    x_0, ends = flow.source.sample(flow.source.observe(x_1), noise()), x_1[:, [0, -1]]
+    many = flow.flow(x_0, setting, ends)
+    assert seen == [PIECE, PIECE, PIECE, PIECE, 100, 100]
+    assert torch.equal(many, flow.flow(x_0, setting, ends))
+    for rows in (slice(10), slice(PIECE - 5, PIECE + 5), slice(-10, None)):
+        # Single precision: matrix products of other sizes round otherwise.
+        torch.testing.assert_close(flow.flow(x_0[rows], setting, ends[rows]), many[rows], rtol=0, atol=1e-5)
 
 
 def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from conflow import __main__ as command_line
 from conflow.experiment import config, signals, tracking
 from conflow.experiment.build import fitted, random_stream
 from conflow.experiment.module import ConFlow
+from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
 from conflow.planner import PlanError, Planner, Plans, _ranked, exact
 from conflow.scene.constraint import Obstacle, RobotAvoidance
@@ -149,6 +150,19 @@ def test_clearance_and_smoothness_are_those_of_the_trajectories_returned() -> No
         assert rough.item() == pytest.approx(float(torch.stack(bends).mean()), rel=1e-5)
     without = planner(still=True).plan(START, GOAL, 20)
     assert without.clearance[0].item() == pytest.approx(clearance(without.x[0], []), abs=1e-4)
+
+
+def test_the_network_sees_no_more_plans_at_a_time_the_more_are_asked_for() -> None:
+    """And whichever piece a plan falls into, it starts and ends where it should."""
+    flow, seen = planner("network.sees_ends=true", "sample.steps=1"), list[int]()
+    flow.model.v.register_forward_hook(lambda _, inputs, __: seen.append(len(inputs[0])))
+    pairs, num = swap(3), PIECE // 2 + 1
+    plans = flow.plan(pairs[:, 0], pairs[:, -1], num)
+    assert seen == [PIECE, 3 * num - PIECE]
+    assert torch.equal(plans.x[:, :, 0], pairs[:, :1].expand(-1, num, -1))
+    single = flow.plan(pairs[2, 0], pairs[2, -1], num)
+    # Matrix products of other sizes round otherwise, and may exchange plans that are alike.
+    torch.testing.assert_close(single.smoothness, plans[2].smoothness, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("still", [False, True])

@@ -12,6 +12,7 @@ from conflow.experiment.datamodule import Split
 from conflow.experiment.metrics import EnergyDistance, endpoint_error, trajectory_metrics
 from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
 from conflow.experiment.progress import ProgressDisplay
+from conflow.flow.sampler import PIECE
 
 LATENCY_BATCH = 256
 
@@ -85,7 +86,8 @@ def measure(model: ConFlow, x: Tensor, x_1: Tensor, reference: Tensor | None) ->
     With the energy distance to a reference (m, T, D) where there is one.
     """
     metrics = trajectory_metrics(model.robots, model.obstacle, reference).to(model.device)
-    metrics.update(x=x, x_1=x_1)
+    for piece, demonstrated in zip(x.split(PIECE), x_1.split(PIECE), strict=True):
+        metrics.update(x=piece, x_1=demonstrated)
     return metrics.compute() | {"num": len(x)}
 
 

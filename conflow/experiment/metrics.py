@@ -18,8 +18,8 @@ Z = 1.959963984540054
 """The 97.5 % quantile of the standard normal: all intervals are 95 % intervals."""
 REACHED = 0.01
 """Starts and goals count as reached within this `endpoint_error`, in workspace units per robot."""
-PAIR_ROWS = 1000
-"""Rows of distances held at a time: 80 MB against 10,000 trajectories, where all pairs would take 800 MB."""
+PAIR_ROWS, PAIR_COLUMNS = 1000, 10_000
+"""Distances held at a time: 80 MB, where all pairs of 10,000 trajectories would take 800 MB."""
 
 
 def wilson(count: float, total: float) -> tuple[float, float]:
@@ -94,8 +94,12 @@ def _distance_sums(x: Tensor, y: Tensor) -> Tensor:
     In double precision: cdist takes |x|^2 + |y|^2 - 2 <x, y>, which in single precision puts equal trajectories some
     1e-3 apart, as much as the energy distance of a good model, and a collapsed one would look diverse.
     """
-    y = y.double().flatten(1)
-    return torch.cat([torch.cdist(rows.double(), y).sum(dim=1) for rows in x.flatten(1).split(PAIR_ROWS)])
+    columns = y.flatten(1).split(PAIR_COLUMNS)
+
+    def sums(rows: Tensor) -> Tensor:
+        return torch.stack([torch.cdist(rows.double(), part.double()).sum(dim=1) for part in columns]).sum(dim=0)
+
+    return torch.cat([sums(rows) for rows in x.flatten(1).split(PAIR_ROWS)])
 
 
 def _residual(x: Tensor, b: Tensor) -> Tensor:

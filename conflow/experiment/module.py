@@ -25,7 +25,7 @@ from conflow.experiment.config import Config, ConfigError
 from conflow.flow.correction import Correction
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import end, guided_path, interpolate, velocity
-from conflow.flow.sampler import GUIDANCE, Field, integrate
+from conflow.flow.sampler import GUIDANCE, Field, in_pieces, integrate
 
 Setting = Literal["none", "robot", "obstacle"]
 SETTINGS: tuple[Setting, ...] = get_args(Setting)
@@ -121,7 +121,11 @@ class ConFlow(LightningModule):
 
     def flow(self, x_0: Tensor, setting: Setting = "none", ends: Tensor | None = None) -> Tensor:
         """Where the ODE of `field` takes samples x_0 of the source, (batch, T, D)."""
-        return integrate(self.field(setting, ends), x_0, self.config.sample.steps, self.config.sample.solver)
+
+        def arrive(x_0: Tensor, ends: Tensor | None = None) -> Tensor:
+            return integrate(self.field(setting, ends), x_0, self.config.sample.steps, self.config.sample.solver)
+
+        return in_pieces(arrive, x_0) if ends is None else in_pieces(arrive, x_0, ends)
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         train = self.config.train

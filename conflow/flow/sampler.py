@@ -12,6 +12,9 @@ from conflow.flow.path import end
 Field = Callable[[Tensor, Tensor], Tensor]
 """A velocity field: x (batch, T, D) and t (batch,) to dx/dt (batch, T, D)."""
 
+PIECE = 2048
+"""Trajectories that a network sees at a time, the same on every machine: a matrix product's bits vary with its size."""
+
 Solver = Literal["euler", "midpoint", "rk4"]
 
 
@@ -111,3 +114,11 @@ def states(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler") ->
 def integrate(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler") -> Tensor:
     """x_1: where the ODE that starts at x_0 (batch, T, D) arrives at t = 1."""
     return deque(states(v, x_0, steps, solver), maxlen=1).pop()
+
+
+def in_pieces(f: Callable[..., Tensor], *batches: Tensor) -> Tensor:
+    """f(*batches), row by row a function of its arguments (batch, ...), for PIECE rows at a time.
+
+    What f needs beside its result, such as a network's activations, does not grow with the batch then.
+    """
+    return torch.cat([f(*piece) for piece in zip(*(batch.split(PIECE) for batch in batches), strict=True)])

@@ -133,7 +133,7 @@ TOO_LARGE = [
     (("data.num=100000000", "data.horizon=4096"), "data.num=100000000: takes 24415"),
     (("network.hidden=65536", "network.blocks=1024"), "network.blocks=1024, network.hidden=65536: takes 131"),
     (("train.batch_size=1000000000",), "train.batch_size=1000000000: takes "),
-    (("sample.num=1000000000",), "sample.num=1000000000: takes 2385"),
+    (("sample.num=1000000000",), "sample.num=1000000000: takes 3815"),
 ]
 
 
@@ -374,7 +374,7 @@ OPTIONS = [
     (("evaluate", "run=nobody"), "run=nobody: no such finished run, expected latest, an id or a name"),
     (("evaluate", "train.lr=1"), "train.lr=1: fixed by the run, expected settings of sample. and seed only"),
     (("evaluate", "sample.steps=0"), f"sample.steps=0: {WHOLE} of at least 1"),
-    (("evaluate", "sample.num=1000000000"), f"sample.num=1000000000: takes 2385{GIB}"),
+    (("evaluate", "sample.num=1000000000"), f"sample.num=1000000000: takes 3815{GIB}"),
     (("evaluate", "seed=3 # ../../x"), f"seed=3 # ../../x: {WHOLE}"),
     (("compare", "format=xml"), "format=xml: expected one of table, markdown, csv, json"),
     (("compare", "preset=it's"), "preset=it's: expected one of long, paper, quick, smoke"),
