@@ -179,6 +179,15 @@ def test_a_config_survives_being_written_and_read() -> None:
     assert again.sha() == settings.sha() != config.load(["ablation=gp"]).sha()
 
 
+def test_the_accelerator_is_no_part_of_what_an_experiment_is() -> None:
+    """So a run may go on with another, and records from before there was the setting are unchanged."""
+    here, there = (config.load([f"train.accelerator={name}"]) for name in ("cpu", "auto"))
+    assert here.train != there.train
+    assert here.sha() == there.sha()
+    assert "train.accelerator" not in config.flatten(here.identity())
+    assert config.flatten(here.tree()).keys() - config.flatten(here.identity()).keys() == {"train.accelerator"}
+
+
 @pytest.mark.parametrize(
     ("argument", "said"),
     [

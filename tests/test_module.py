@@ -171,6 +171,23 @@ def test_samples_do_not_depend_on_how_many_are_asked_for(setting: Setting) -> No
         torch.testing.assert_close(flow.flow(x_0[rows], setting, ends[rows]), many[rows], rtol=0, atol=1e-5)
 
 
+ABLATIONS = [["ablation=cgp"], ["ablation=plus", "source.fit=false"], ["ablation=guided_path"], ["ablation=gaussian"]]
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS, ids=lambda arguments: arguments[0])
+def test_training_and_sampling_need_a_device_no_float64(ablation: list[str]) -> None:
+    """Apple's has none. "meta", which only knows shapes, refuses to mix its tensors with those left on the CPU."""
+    flow = model(*ablation, "sample.steps=1").to("meta")
+    left = {name for name, tensor in flow.state_dict().items() if tensor.device.type == "cpu"}
+    moved = {tensor.dtype for tensor in [*flow.parameters(), *flow.buffers()] if tensor.device.type == "meta"}
+    assert left == {f"source.{name}" for name in ("prior", "mean_map", "covariance", "modes", "variance")}
+    assert moved <= {torch.float32, torch.int64}
+    x_1, M = torch.zeros(8, 32, 4, device="meta"), torch.zeros(8, dtype=torch.bool, device="meta")
+    results = [flow.sample(x_1, setting) for setting in SETTINGS]
+    results += [flow.loss(x_1, M, None), flow.source.mean(flow.source.observe(x_1))]  # type: ignore[arg-type]
+    assert {(result.device.type, result.dtype) for result in results} == {("meta", torch.float32)}
+
+
 def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("autograd on the sampling path")

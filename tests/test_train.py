@@ -55,7 +55,7 @@ def test_a_run_is_finished_named_tagged_and_has_every_setting(trained: tuple[Run
         "config_sha": settings.sha(),
     }
     assert {"git_sha", "git_dirty", "host"} <= set(run.data.tags)
-    assert run.data.params == {key: str(value) for key, value in config.flatten(settings.tree()).items()}
+    assert run.data.params == {key: str(value) for key, value in config.flatten(settings.identity()).items()}
     assert config.from_tree(yaml.safe_load((artifacts(run) / "config.yaml").read_text())) == settings
 
 

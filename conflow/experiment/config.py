@@ -36,6 +36,7 @@ Place = Literal["point", "end"]
 Mask = Literal["violates", "feasible"]
 PathKind = Literal["linear", "guided"]
 Norm = Literal["waypoints", "modes"]
+Accelerator = Literal["auto", "cpu", "gpu", "mps"]
 Tree = dict[str, Any]
 
 
@@ -154,6 +155,7 @@ class Train:
     norm: Norm
     log_every: Count
     val_every: Count
+    accelerator: Accelerator
 
 
 @dataclass(frozen=True)
@@ -195,9 +197,15 @@ class Config:
         """The whole as nested dictionaries of plain values."""
         return dataclasses.asdict(self)
 
+    def identity(self) -> Tree:
+        """The settings that say which experiment this is: all but the accelerator, on which it may go on elsewhere."""
+        tree = self.tree()
+        del tree["train"]["accelerator"]
+        return tree
+
     def sha(self) -> str:
-        """A fingerprint of all settings, 16 hexadecimal digits."""
-        return hashlib.sha256(yaml.safe_dump(self.tree()).encode()).hexdigest()[:16]
+        """A fingerprint of `identity`, 16 hexadecimal digits."""
+        return hashlib.sha256(yaml.safe_dump(self.identity()).encode()).hexdigest()[:16]
 
 
 def names(axis: str) -> list[str]:
@@ -419,13 +427,18 @@ def check_memory(key: str, value: int, needed: int) -> None:
 
 
 def check_training(config: Config) -> None:
-    """Refuse a network and a batch that cannot be trained in this machine's memory, before anything is made.
+    """Refuse an accelerator that is missing, and a network and a batch that do not fit into this machine's memory.
 
     Where demonstrations are read from a file, T and D are not known yet, and the smallest are assumed.
 
     Raises:
-        ConfigError: names the setting, the memory that it would take and that of the machine.
+        ConfigError: names the setting, what it asks for and what the machine has.
     """
+    cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
+    has = {"auto": True, "cpu": True, "gpu": cuda or mps, "mps": mps}
+    if not has[config.train.accelerator]:
+        known = ", ".join(name for name, there in has.items() if there)
+        raise ConfigError(f"train.accelerator={config.train.accelerator}: not on this machine, expected one of {known}")
     network, batch = config.network, config.train.batch_size
     size = 4 * config.data.horizon if config.data.path is None else 12
     weights = 2 * network.blocks * network.hidden**2
@@ -435,7 +448,7 @@ def check_training(config: Config) -> None:
     check_memory(f"network.blocks={network.blocks}, network.hidden", network.hidden, 16 * weights)
     # x_0, x_1, x_t, u_t and v; and what the backward pass needs of each block.
     floats = 5 * size + 4 * network.blocks * network.hidden
-    if not torch.cuda.is_available():  # whose memory is another
+    if config.train.accelerator == "cpu" or not cuda:  # whose memory is another
         check_memory("train.batch_size", batch, 4 * batch * floats)
 
 

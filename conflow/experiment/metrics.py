@@ -91,10 +91,11 @@ def _positions(x: Tensor) -> Tensor:
 def _distance_sums(x: Tensor, y: Tensor) -> Tensor:
     """sum_j |x_i - y_j| over all T D numbers for x (n, T, D) and y (m, T, D), (n,).
 
-    In double precision: cdist takes |x|^2 + |y|^2 - 2 <x, y>, which in single precision puts equal trajectories some
-    1e-3 apart, as much as the energy distance of a good model, and a collapsed one would look diverse.
+    In double precision, which not every accelerator has: cdist takes |x|^2 + |y|^2 - 2 <x, y>, which in single
+    precision puts equal trajectories some 1e-3 apart, as much as the energy distance of a good model, and a collapsed
+    one would look diverse.
     """
-    columns = y.flatten(1).split(PAIR_COLUMNS)
+    x, columns = x.cpu(), y.cpu().flatten(1).split(PAIR_COLUMNS)
 
     def sums(rows: Tensor) -> Tensor:
         return torch.stack([torch.cdist(rows.double(), part.double()).sum(dim=1) for part in columns]).sum(dim=0)
@@ -107,7 +108,7 @@ def _residual(x: Tensor, b: Tensor) -> Tensor:
 
     E|x - x'|^2 - 2 E b^2 + (E b)^2, whose first term is twice the trace of x's covariance.
     """
-    return (2 * x.double().flatten(1).var(dim=0).sum() - 2 * (b * b).mean() + b.mean() ** 2).clamp_min(0)
+    return (2 * x.cpu().double().flatten(1).var(dim=0).sum() - 2 * (b * b).mean() + b.mean() ** 2).clamp_min(0)
 
 
 class _Rate(Metric):
@@ -242,7 +243,7 @@ class EndpointError(_Values):
         self.values.append(endpoint_error(x, x_1, self.waypoint))
 
     def compute(self) -> dict[str, float]:
-        values = dim_zero_cat(self.values).double()
+        values = dim_zero_cat(self.values).cpu().double()
         mean, spread = float(values.mean()), Z * float(values.std()) / math.sqrt(len(values))
         return {self.name: mean, f"{self.name}_low": mean - spread, f"{self.name}_high": mean + spread}
 

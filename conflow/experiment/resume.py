@@ -44,7 +44,7 @@ def check(run: Run, config: Config, data: DemonstrationData) -> None:
 
 def _differences(run: Run, config: Config) -> str:
     # The run's params, not its config.yaml, which a run that was interrupted early may lack.
-    own, asked = run.data.params, {key: str(value) for key, value in flatten(config.tree()).items()}
+    own, asked = run.data.params, {key: str(value) for key, value in flatten(config.identity()).items()}
     different = [key for key in own | asked if own.get(key) != asked.get(key)]
     found, expected = (", ".join(f"{key}={values.get(key, 'none')}" for key in different) for values in (asked, own))
     return f"found {found}, expected the run's own {expected}"

@@ -288,7 +288,7 @@ def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
 
 
 def _describe(store: MlflowClient, run_id: str, config: Config, data: DemonstrationData) -> None:
-    store.log_batch(run_id, params=[Param(key, str(value)) for key, value in flatten(config.tree()).items()])
+    store.log_batch(run_id, params=[Param(key, str(value)) for key, value in flatten(config.identity()).items()])
     store.log_dict(run_id, config.tree(), CONFIG_FILE)
     _log_dataset(store, run_id, data)
 

@@ -103,7 +103,7 @@ def trainer(config: Config, logger: tracking.RunLogger, data: DemonstrationData,
     _quiet()
     interval = min(config.train.val_every, config.train.max_steps)
     return Trainer(
-        accelerator="auto",
+        accelerator=config.train.accelerator,
         devices=1,
         logger=logger,
         callbacks=[

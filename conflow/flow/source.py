@@ -5,7 +5,7 @@ on the values y at some of them (Eq. gp_posterior). Endpoint conditioning is O =
 more indices, and a source conditioned on nothing is O = {}.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -83,13 +83,20 @@ class Source(nn.Module):
         self.register_buffer("variance", variance)
         self.register_buffer("sampling_map", torch.cat([W, E * variance.sqrt()], dim=1).to(torch.get_default_dtype()))
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Source":
+        """As of any module, but float64 stays as it is, on the CPU: some devices lack it, and none needs it."""
+        super()._apply(  # type: ignore[no-untyped-call]
+            lambda tensor: tensor if tensor.dtype == torch.float64 else fn(tensor), recurse
+        )
+        return self
+
     def observe(self, x: Tensor) -> Tensor:
         """The values y of trajectories x (batch, T, D) at the conditioned waypoints, (batch, O, D)."""
         return x[:, self.index]
 
     def mean(self, y: Tensor) -> Tensor:
         """W y: the mean trajectory given y (batch, O, D), in y's precision, (batch, T, D)."""
-        return self.mean_map.to(y.dtype) @ y
+        return self.mean_map.to(y.dtype).to(y.device) @ y  # in this order, for devices without float64
 
     def condition(self, index: Sequence[int], noise: Sequence[float] = ()) -> "Source":
         """The same prior K conditioned on other waypoints, whatever this source is conditioned on.

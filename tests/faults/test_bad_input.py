@@ -112,6 +112,8 @@ SETTINGS = [
     ("train.max_steps=0", f"train.max_steps=0: {WHOLE} of at least 1"),
     ("train.max_steps=${foo}", f"train.max_steps=${{foo}}: {WHOLE}"),
     ("train.batch_size=10000000000", f"train.batch_size=10000000000: {WHOLE} of at least 1 and at most 1000000000"),
+    ("train.accelerator=cuda", "train.accelerator=cuda: expected one of auto, cpu, gpu, mps"),
+    ("train.accelerator=mps", "train.accelerator=mps: not on this machine, expected one of auto, cpu"),
     (f"sample.num={HUGE}", f"...: {WHOLE} of at least 2 and at most 1000000000"),
     ("sample.obstacle={x: 1}", "sample.obstacle: no such setting"),
     ("sample.obstacle.x=1e39", f"sample.obstacle.x=1e+39: {FINITE} of at least -2 and at most 2"),
