@@ -87,6 +87,8 @@ def test_a_users_labels_are_kept(smoke: Config, tmp_path: Path) -> None:
     labels = np.arange(200) % 2 == 0
     data = DemonstrationData(on_file(smoke, tmp_path / "mine.npz", x=swap(200).numpy(), violates=labels))
     assert np.array_equal(data.violates.numpy(), labels)
+    inverted = DemonstrationData(on_file(smoke, tmp_path / "other.npz", x=swap(200).numpy(), violates=~labels))
+    assert inverted.digest != data.digest, "other labels are other demonstrations"
 
 
 @pytest.mark.parametrize(("ablation", "violates", "said"), [("cgp", False, "needs D-"), ("fm", True, "no trajectory")])

@@ -92,11 +92,13 @@ def test_a_seed_is_a_data_set() -> None:
 
 
 def test_the_digest_tells_any_two_data_sets_apart() -> None:
-    """It follows the numbers and the shape, down to one bit, and not the layout in memory."""
+    """It follows the numbers, the shape and the labels, down to one bit, and not the layout in memory."""
     x = swap(10)
     changed = x.clone()
     changed[3, 4, 1] = torch.nextafter(changed[3, 4, 1], torch.tensor(2.0))
     assert len({digest(x), digest(changed), digest(x.view(20, 16, 4)), digest(x[:9]), digest(x.flip(0))}) == 5
+    labels = torch.arange(10) % 2 == 0
+    assert len({digest(x), digest(x, labels), digest(x, ~labels), digest(changed, labels)}) == 4
     assert digest(x.transpose(0, 1).contiguous().transpose(0, 1)) == digest(x)
 
 

@@ -78,7 +78,7 @@ class DemonstrationData(LightningDataModule):
 
     Attributes:
         x, violates: all demonstrations and their labels M.
-        digest: fingerprint of x.
+        digest: fingerprint of x, and of the labels that came with it; others follow from x and the config.
 
     Raises:
         DemonstrationError: the demonstrations cannot be used, or a class that the ablation needs is missing.
@@ -95,7 +95,7 @@ class DemonstrationData(LightningDataModule):
         # x_0, x_1, and what each of the three settings makes of them; the metrics join one, and double its precision.
         check_memory("sample.num", config.sample.num, 8 * 4 * config.sample.num * self.T * self.D)
         self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
-        self.digest = trajectories.digest(x)
+        self.digest = trajectories.digest(x, violates)
         self.train, self.val, self.test = self._split(name)
 
     def _demonstrations(self) -> tuple[str, trajectories.Demonstrations]:

@@ -274,8 +274,10 @@ def save(path: str | Path, x: Tensor) -> None:
         raise DemonstrationError(f"out={path}: {error.strerror}, expected a new file in an existing folder") from None
 
 
-def digest(x: Tensor) -> str:
-    """A fingerprint of trajectories: SHA-256 over shape and bytes, 16 hexadecimal digits."""
+def digest(x: Tensor, violates: Tensor | None = None) -> str:
+    """A fingerprint of demonstrations: SHA-256 over shape and bytes, and over their author's labels, 16 hex digits."""
     content = hashlib.sha256(str(tuple(x.shape)).encode())
     content.update(x.contiguous().numpy().tobytes())
+    if violates is not None:
+        content.update(violates.numpy().tobytes())
     return content.hexdigest()[:16]
