@@ -78,7 +78,7 @@ class Planner:
 
     @classmethod
     def load(cls, run: str | Path = "latest") -> "Planner":
-        """The planner of a run: its id, its name, "latest", or the path of a `model.ckpt`, which needs no store.
+        """The planner of a run: "latest", its id, NAME, PRESET/NAME, or the path of a `model.ckpt`, without a store.
 
         Only weights and plain values are read; no code in the file is executed.
 
@@ -246,12 +246,14 @@ def _ranked(x: Tensor, constraint: Constraint) -> Plans:
 
 
 def _checkpoint(run: str | Path) -> Path:
-    """Where the checkpoint of a run is; a text with a slash or the ending .ckpt is a path."""
+    """Where the checkpoint of a run is; a text is a path if it ends in .ckpt or there is such a file."""
     if not isinstance(run, str | Path):
-        raise PlanError(f"run={brief(run)}: expected a run's id or name, latest, or the path of a {MODEL_FILE}")
-    if isinstance(run, Path) or "/" in run or run.endswith(".ckpt"):
+        raise PlanError(f"run={brief(run)}: expected latest, an id, NAME, PRESET/NAME, or the path of a {MODEL_FILE}")
+    if isinstance(run, Path) or run.endswith(".ckpt"):
         return Path(run)
     try:
+        if Path(run).is_file():
+            return Path(run)
         return artifact(find_run(run), MODEL_FILE)
     except ConfigError as error:
         raise PlanError(str(error)) from None

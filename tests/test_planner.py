@@ -364,7 +364,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_in_one_line_and_never_executed(
         Planner.load(tmp_path / "none.ckpt")
 
 
-def test_a_run_is_found_by_its_name_its_id_or_as_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_found_by_whatever_names_it_or_by_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.chdir(tmp_path)
     flow = planner()
@@ -375,10 +375,15 @@ def test_a_run_is_found_by_its_name_its_id_or_as_the_latest(tmp_path: Path, monk
     store.log_artifact(ids[1], str(save(flow.model, tmp_path / "model.ckpt")))
     for run_id in ids:
         store.set_terminated(run_id)
-    for wanted in ("cgp-s0", ids[1], "latest"):
+    store.set_tag(ids[1], "preset", "long")
+    (tmp_path / "models").mkdir()
+    save(flow.model, tmp_path / "models" / "mine")
+    for wanted in ("cgp-s0", ids[1], "latest", "long/cgp-s0", "models/mine"):
         assert torch.equal(Planner.load(wanted).plan(START, GOAL, 3).x, flow.plan(START, GOAL, 3).x)
     with pytest.raises(PlanError, match=r"run=cpg-s0: no such finished run.*did you mean cgp-s0\?"):
         Planner.load("cpg-s0")
+    with pytest.raises(PlanError, match=r"run=lnog/cgp-s0: no such finished run.*did you mean long/cgp-s0\?"):
+        Planner.load("lnog/cgp-s0")
     with pytest.raises(PlanError, match=r"run=empty-s0: .*model.ckpt"):
         Planner.load("empty-s0")
 

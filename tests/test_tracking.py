@@ -13,9 +13,10 @@ from mlflow.entities import Run
 from rich.console import Console
 from sqlalchemy import Engine, event
 
-from conflow.experiment import config, signals, tracking
+from conflow.experiment import alive, config, resume, signals, tracking
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.progress import ProgressDisplay
+from conflow.experiment.record import Record
 from tests.conftest import raising_signals
 
 
@@ -261,3 +262,84 @@ def test_a_run_is_found_by_its_id_its_name_or_its_preset_and_name(store_folder: 
     }
     with pytest.raises(config.ConfigError, match="run=paper/cgp-s0: no such finished run"):
         tracking.find_run("paper/cgp-s0")
+
+
+def test_an_interrupted_run_is_found_although_one_of_its_name_has_finished_since(store_folder: Path) -> None:
+    store = tracking.client()
+    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    assert experiment is not None
+    made: list[str] = []
+    for preset, status in (("long", "KILLED"), ("long", "KILLED"), ("quick", "KILLED"), ("smoke", "FINISHED")):
+        run = store.create_run(experiment.experiment_id, run_name="cgp-s0", tags={"preset": preset})
+        store.set_terminated(run.info.run_id, status)
+        made.append(str(run.info.run_id))
+    wanted = {"long/cgp-s0": 1, "quick/cgp-s0": 2, "cgp-s0": 2, "latest": 2, made[0]: 0}
+    assert {name: str(resume.find(name).info.run_id) for name in wanted} == {
+        name: made[i] for name, i in wanted.items()
+    }
+    for finished in ("smoke/cgp-s0", made[3]):
+        with pytest.raises(config.ConfigError, match="expected an interrupted run, found one that is FINISHED"):
+            resume.find(finished)
+    with pytest.raises(config.ConfigError, match=r"resume=logn/cgp-s0: no such run.*did you mean long/cgp-s0\?"):
+        resume.find("logn/cgp-s0")
+
+
+def interrupted(data: DemonstrationData) -> Run:
+    """A run that has failed after some writes."""
+
+    def fail() -> None:
+        with tracking.start(data.config, data) as logger:
+            logger.save()
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    return tracking.runs()[0]
+
+
+def test_the_hours_between_an_interruption_and_its_resumption_are_no_work(store_folder: Path) -> None:
+    data = DemonstrationData(config.load(["preset=smoke"]))
+    run = interrupted(data)
+    before = tracking.at_work(run)
+    time.sleep(1.5)
+    start = time.monotonic()
+    with tracking.start(data.config, data, run):
+        time.sleep(0.2)
+    elapsed = time.monotonic() - start
+    (run,) = tracking.runs("FINISHED")
+    assert before + 0.2 <= tracking.at_work(run) <= before + elapsed + 2e-3  # two are rounded
+    assert tracking.at_work(run) < (run.info.end_time - run.info.start_time) / 1000 - 1.4
+    assert Record.of(run).seconds == tracking.at_work(run)
+
+
+def test_a_killed_run_was_at_work_until_its_last_write(store_folder: Path) -> None:
+    """Not until a later command found it gone, which is what the store takes for its end."""
+    data = DemonstrationData(config.load(["preset=smoke"]))
+    run = interrupted(data)
+    store = tracking.client()
+    store.set_terminated(run.info.run_id, "KILLED", end_time=run.info.start_time + 3_600_000)
+    assert tracking.at_work(store.get_run(run.info.run_id)) < 60
+    store.delete_tag(run.info.run_id, "seconds")  # as one of before there was it
+    assert tracking.at_work(store.get_run(run.info.run_id)) == 3600
+
+
+def test_sampling_a_run_again_is_no_work_of_its_training(store_folder: Path) -> None:
+    data = DemonstrationData(config.load(["preset=smoke"]))
+    with tracking.start(data.config, data):
+        pass
+    (run,) = tracking.runs()
+    time.sleep(0.1)
+    logger = tracking.RunLogger(tracking.client(), run.info.run_id)
+    logger.log_metrics({"evaluate/same settings/none/num": 1})
+    logger.save()
+    assert tracking.runs()[0].data.tags["seconds"] == run.data.tags["seconds"]
+
+
+@pytest.mark.parametrize(("note", "kept"), [(alive.GONE, None), ("Mine.", "Mine.")])
+def test_a_run_that_goes_on_is_no_longer_said_to_be_gone(note: str, kept: str | None, store_folder: Path) -> None:
+    data = DemonstrationData(config.load(["preset=smoke"]))
+    run = interrupted(data)
+    tracking.client().set_tag(run.info.run_id, alive.NOTE, note)
+    with tracking.start(data.config, data, tracking.runs()[0]):
+        assert tracking.runs()[0].data.tags.get(alive.NOTE) == kept
+    assert tracking.runs()[0].data.tags.get(alive.NOTE) == kept

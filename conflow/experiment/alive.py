@@ -10,6 +10,8 @@ from filelock import FileLock, Timeout
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
+NOTE = "mlflow.note.content"
+"""The tag that MLflow's pages show as a run's description."""
 GONE = "The process ended without a word; a later command found it gone."
 
 
@@ -53,6 +55,6 @@ def mark_dead(store: MlflowClient, experiment: str, folder: Path) -> None:
     for run in store.search_runs([experiment], "attributes.status = 'RUNNING'"):
         # A run that has ended since the search let go of its lock as well, but says so.
         if not is_alive(run, folder) and store.get_run(run.info.run_id).info.status == "RUNNING":
-            store.set_tag(run.info.run_id, "mlflow.note.content", GONE)
+            store.set_tag(run.info.run_id, NOTE, GONE)
             store.set_terminated(run.info.run_id, "KILLED")
             (folder / Path(run.data.tags["lock"]).name).unlink(missing_ok=True)

@@ -28,7 +28,7 @@ class Record:
         settings: its whole config, flat, as text.
         metrics: the results, without the curves of training.
         origin: the program's revision, versions, hardware and data that it was made with.
-        seconds: from the run's start to its end.
+        seconds: that it was trained and evaluated, without those in which it was interrupted.
     """
 
     run_id: str
@@ -46,10 +46,9 @@ class Record:
         tags = run.data.tags
         metrics = {key: value for key, value in sorted(run.data.metrics.items()) if key.startswith(PUBLISHED)}
         origin = {key: tags[key] for key in ORIGIN if key in tags}
-        seconds = (run.info.end_time - run.info.start_time) / 1000
         settings = dict(sorted(run.data.params.items()))
         where = (str(run.info.run_id), tags["ablation"], tags["preset"], int(tags["seed"]))
-        return cls(*where, settings, metrics, origin, seconds)
+        return cls(*where, settings, metrics, origin, tracking.at_work(run))
 
     @classmethod
     def read(cls, path: Path) -> "Record":

@@ -3,7 +3,7 @@
 from mlflow.entities import Run
 
 from conflow.experiment import tracking
-from conflow.experiment.config import Config, ConfigError, flatten, nearest
+from conflow.experiment.config import Config, ConfigError, flatten
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.finished import check_data
 
@@ -11,21 +11,22 @@ INTERRUPTED = ("KILLED", "FAILED")
 
 
 def find(wanted: str) -> Run:
-    """The newest run with this id or name, or the newest that was interrupted for "latest".
+    """The newest interrupted run that is meant by an id, NAME, PRESET/NAME or "latest".
 
     Raises:
         ConfigError: there is none, or it was not interrupted.
     """
     runs = tracking.runs()
-    known = sorted({str(run.info.run_name) for run in runs if run.info.status in INTERRUPTED})
+    interrupted = [run for run in runs if run.info.status in INTERRUPTED]
+    for run in interrupted:
+        if tracking.means(wanted, run):
+            return run
     for run in runs:
-        if wanted in (run.info.run_id, run.info.run_name) or (wanted == "latest" and run.info.status in INTERRUPTED):
-            if run.info.status in INTERRUPTED:
-                return run
+        if wanted != "latest" and tracking.means(wanted, run):
             raise ConfigError(f"resume={wanted}: expected an interrupted run, found one that is {run.info.status}")
     raise ConfigError(
-        f"resume={wanted}: no such run, expected latest, an id or a name{nearest(wanted, known)}"
-        if known
+        f"resume={wanted}: no such run, {tracking.expected(wanted, interrupted)}"
+        if interrupted
         else f"resume={wanted}: expected an interrupted run, found none"
     )
 

@@ -9,7 +9,7 @@ import socket
 import sqlite3
 import subprocess
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
@@ -158,22 +158,35 @@ def _relocate(old: str, new: str) -> None:
 
 
 def find_run(wanted: str) -> Run:
-    """The run with this id, or the newest finished one of this name or PRESET/NAME, or of any for "latest".
+    """The newest finished run that is meant by an id, NAME, PRESET/NAME or "latest".
 
     Raises:
         ConfigError: there is none.
     """
     finished = runs("FINISHED")
     for run in finished:
-        name = run.info.run_name
-        if wanted in ("latest", run.info.run_id, name, f"{run.data.tags.get('preset')}/{name}"):
+        if means(wanted, run):
             return run
-    known = sorted({str(run.info.run_name) for run in finished})
     raise ConfigError(
-        f"run={wanted}: no such finished run, expected latest, an id or a name{nearest(wanted, known)}"
-        if known
+        f"run={wanted}: no such finished run, {expected(wanted, finished)}"
+        if finished
         else f"run={wanted}: no run has finished yet, expected one; try: make train"
     )
+
+
+def means(wanted: str, run: Run) -> bool:
+    """Whether a run may be meant by "latest", an id, NAME or PRESET/NAME."""
+    return wanted in ("latest", run.info.run_id, *_names(run))
+
+
+def expected(wanted: str, runs: Sequence[Run]) -> str:
+    """How the runs there are can be named, with the name that is most like the wanted one."""
+    known = sorted({name for run in runs for name in _names(run)})
+    return f"expected latest, an id, NAME or PRESET/NAME{nearest(wanted, known)}"
+
+
+def _names(run: Run) -> tuple[str, str]:
+    return str(run.info.run_name), f"{run.data.tags.get('preset')}/{run.info.run_name}"
 
 
 def artifact(run: Run, name: str) -> Path:
@@ -199,6 +212,11 @@ class RunLogger(MLFlowLogger):
         self.written = {(key, point.step) for key in keys for point in store.get_metric_history(run_id, key)}
         self.buffer: list[Metric] = []
         self.flushed = time.monotonic()
+        self.began: float | None = None
+
+    def count(self, before: float) -> None:
+        """Keep from now on the tag `seconds`, for how long the run has been at work; `before` is what it has by now."""
+        self.began = time.monotonic() - before
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         now = int(time.time() * 1000)
@@ -214,10 +232,12 @@ class RunLogger(MLFlowLogger):
         """`start` has logged the whole config."""
 
     def save(self) -> None:
-        """Write what is buffered."""
+        """Write what is buffered, and up to when the run was at work."""
         with whole():
             for i in range(0, len(self.buffer), 1000):
                 self.store.log_batch(str(self.run_id), metrics=self.buffer[i : i + 1000])
+            if self.began is not None:
+                self.store.set_tag(str(self.run_id), "seconds", f"{time.monotonic() - self.began:.3f}")
             self.buffer.clear()
             self.flushed = time.monotonic()
 
@@ -254,6 +274,7 @@ def start(config: Config, data: DemonstrationData, resumed: Run | None = None) -
             with held():
                 run_id = _create(store, config, data, lock) if resumed is None else _reopen(store, resumed, lock)
                 logger = RunLogger(store, run_id, again=resumed is not None)
+                logger.count(at_work(resumed) if resumed else 0.0)
             with whole():
                 _describe(store, run_id, config, data)
             yield logger
@@ -283,8 +304,21 @@ def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
         again = {"pid": str(os.getpid()), "resumed": str(int(run.data.tags.get("resumed", 0)) + 1)}
         for key, value in (lock | again).items():
             store.set_tag(run_id, key, value)
+        if run.data.tags.get(alive.NOTE) == alive.GONE:  # no longer true of it
+            store.delete_tag(run_id, alive.NOTE)
         store.update_run(run_id, status="RUNNING")
     return run_id
+
+
+def at_work(run: Run) -> float:
+    """The seconds that a run was trained and evaluated, without those between an interruption and its resumption.
+
+    Of a process that was killed what came after its last write is missing. A run of before this was counted says from
+    when to when it was there.
+    """
+    if "seconds" in run.data.tags:
+        return float(run.data.tags["seconds"])
+    return float(run.info.end_time - run.info.start_time) / 1000
 
 
 def _describe(store: MlflowClient, run_id: str, config: Config, data: DemonstrationData) -> None:
@@ -317,6 +351,7 @@ def _tags(config: Config, data: DemonstrationData) -> dict[str, str]:
         "data_violating_share": f"{data.violates.float().mean():.4f}",
         **{f"data_{split}": str(len(getattr(data, split).x)) for split in ("train", "val", "test")},
         "pid": str(os.getpid()),
+        "seconds": "0",
         **origin(),
     }
 

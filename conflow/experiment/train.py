@@ -28,7 +28,7 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
     Args:
         config: the experiment.
         console: for progress and results.
-        wanted: an interrupted run of this experiment to go on with: its id, its name, or "latest".
+        wanted: an interrupted run of this experiment to go on with: its id, NAME, PRESET/NAME, or "latest".
 
     Raises:
         DemonstrationError: before anything is tracked.

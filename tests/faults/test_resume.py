@@ -8,6 +8,7 @@ import pytest
 import torch
 from mlflow.entities import Run
 
+from conflow.experiment import alive
 from conflow.scene.trajectories import swap
 from tests.faults import processes
 from tests.faults.processes import Death, checkpoint_folder, history, killed_in, runs, store, weights
@@ -78,6 +79,7 @@ def assert_ends_as(whole: Run, folder: Path, interrupted: Run) -> str:
     expected = weights(whole)
     assert all(torch.equal(tensor, expected[name]) for name, tensor in weights(resumed).items())
     assert history(folder, resumed) == history(folder, whole)
+    assert alive.NOTE not in resumed.data.tags
     # What a finished run needs is among its artifacts.
     assert not checkpoint_folder(folder, resumed).exists()
     return output
@@ -121,7 +123,7 @@ def test_what_is_not_the_same_experiment_is_refused_with_the_differences(folder:
         ("resume=latest", "train.lr=0.5", "seed=3"): (
             "resume=cgp-s0: found seed=3, train.lr=0.5, expected the run's own seed=0, train.lr=0.001"
         ),
-        ("resume=cgp-s1",): "resume=cgp-s1: no such run, expected latest, an id or a name; did you mean cgp-s0?",
+        ("resume=cgp-s1",): "no such run, expected latest, an id, NAME or PRESET/NAME; did you mean cgp-s0?",
         (f"resume={whole.info.run_id}",): "expected an interrupted run, found one that is FINISHED",
     }
     for arguments, said in refused.items():
