@@ -9,23 +9,26 @@ import traceback
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import Console
 
 
 def train(arguments: list[str]) -> None:
-    """Train, sample, evaluate and track one experiment, or go on with an interrupted one: resume=RUN or latest."""
+    """Train, sample, evaluate and track one experiment, or go on with an interrupted one: resume=RUN, code=any."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
     # First of all, and with little imported, so that a mistyped setting is answered at once.
-    options, rest = config.options(arguments, {"resume": ""})
+    options, rest = config.options(arguments, {"resume": "", "code": "same"})
+    any_code = _any_code(options)
     settings = config.load(rest)
     config.check_training(settings)
 
     from conflow.experiment.train import train
 
     console = _console()
-    run_id = train(settings, console, options["resume"])
+    run_id = train(settings, console, options["resume"], any_code)
     console.print(f"Run {run_id} is finished. Look at it with: make ui", highlight=False)
 
 
@@ -35,7 +38,8 @@ def ablations(arguments: list[str]) -> None:
 
     signals.raise_on_signals()
     defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
-    options, settings = config.options(arguments, defaults)
+    options, settings = config.options(arguments, defaults | {"code": "same"})
+    any_code = _any_code(options)
     jobs = config.whole(options, "jobs", 1, 1024)
     for key in ("seeds", "ablations"):
         if not options[key].split():
@@ -46,10 +50,19 @@ def ablations(arguments: list[str]) -> None:
     from conflow.experiment import compare, grid, report
 
     console = _console()
-    failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console)
+    failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console, any_code)
     report.render([compare.collect(options["preset"], settings)], "table", console)
     if failed:
         raise config.ConfigError(f"{failed} cells failed; the same command tries them again")
+
+
+def _any_code(options: "Mapping[str, str]") -> bool:
+    """Whether runs of other code than the present are to be taken for those that are asked for."""
+    from conflow.experiment.config import ConfigError
+
+    if options["code"] not in ("same", "any"):
+        raise ConfigError(f"code={options['code']}: expected same or any")
+    return options["code"] == "any"
 
 
 def evaluate(arguments: list[str]) -> None:

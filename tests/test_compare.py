@@ -1,8 +1,10 @@
+import csv
+import io
 import json
 import math
 import statistics
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import get_args
 
@@ -11,7 +13,7 @@ from mlflow.entities import Metric
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import compare, config, report, tracking
+from conflow.experiment import code, compare, config, report, tracking
 from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, Cell
 from conflow.experiment.compare import Comparison
 from conflow.experiment.config import ConfigError
@@ -31,16 +33,18 @@ def add_run(
     *arguments: str,
     status: str = "FINISHED",
     lacking: tuple[str, ...] = (),
+    by: Mapping[str, str] | None = None,
 ) -> str:
     """A run as training leaves it, with the same count of 1,000 trajectories in every setting.
 
-    It was logged before there were the metrics that it is `lacking`.
+    It was logged before there were the metrics that it is `lacking`, `by` the code of these tags or the present one.
     """
     store = tracking.client()
     experiment = store.get_experiment_by_name("conflow")
     assert experiment is not None
     settings = config.load(["preset=smoke", f"ablation={ablation}", f"seed={seed}", *arguments])
     tags = {"ablation": ablation, "preset": "smoke", "seed": str(seed), "config_sha": settings.sha()}
+    tags |= code.tags() if by is None else by
     run_id = store.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
     values: dict[str, float] = {}
     for group in GROUPS:
@@ -294,3 +298,24 @@ def test_without_runs_the_way_to_some_is_named(tmp_path: Path, monkeypatch: pyte
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="preset=paper: no run at this preset has finished; try: make ablations"):
         compare.collect("paper")
+
+
+def test_runs_of_the_present_code_come_before_newer_ones_and_others_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    other = {name: value.replace("flow/path.py:", "flow/path.py:0") for name, value in code.tags().items()}
+    add_run("cgp", 0, 10, 0.01)
+    add_run("cgp", 0, 900, 0.9, by=other)  # newer
+    add_run("fm", 0, 40, 0.1)
+    assert compare.collect("smoke").code == ""
+    assert cell(compare.collect("smoke"), "1", "ConFlow (D+ and D-)", "none: robot").count == 10
+    add_run("cgp", 1, 20, 0.01, by=other)  # there is no other of this seed
+    add_run("gaussian", 0, 20, 0.01, by={})
+    found = compare.collect("smoke")
+    said = "Trained by other code than the present: cgp-s1 (flow/path.py); gaussian-s0 (unknown files)"
+    assert found.code == said
+    for form in get_args(report.Format):
+        assert said in rendered(found, form) + capsys.readouterr().err
+    assert len(list(csv.reader(io.StringIO(rendered(found, "csv"))))[-1]) == len(fields(Cell)), "cells alone"

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import compare, paper, record, report, tracking
+from conflow.experiment import code, compare, paper, record, report, tracking
 from conflow.experiment.cells import Cell
 from conflow.experiment.config import ConfigError, flatten, load
 from conflow.experiment.metrics import wilson
@@ -207,6 +207,22 @@ def test_a_mean_over_seeds_has_students_interval_and_its_networks_that_of_indepe
     assert cell(found, "3", "ConFlow (D+ and D-)", "smoothness, median").within_low is None
 
 
+def test_a_row_of_several_codes_says_so_and_one_of_none_does_not() -> None:
+    made = [published("cgp", seed, 300) for seed in range(3)]
+    changed = published("cgp", 0, 300, "train.batch_size=512")
+    assert [found.code for found in compare.collect_reference()] == [""]
+    for one, sha in zip((*made[1:], changed), ("a" * 16, "a" * 16, "b" * 16), strict=True):
+        replace(one, origin={"code_sha": sha}).write(record.FOLDER)
+    (found,) = compare.collect_reference()
+    assert found.code == f"Rows of runs by different code: cgp (s0: unknown; s1, s2: {'a' * 16})"
+    console = Console(width=200)
+    with console.capture() as captured:
+        report.render([found], "markdown", console)
+    assert captured.get().rstrip().endswith(found.code)
+    replace(made[0], origin={"code_sha": "a" * 16}).write(record.FOLDER)
+    assert [found.code for found in compare.collect_reference()] == [""]
+
+
 def test_no_records_and_broken_ones_are_named() -> None:
     with pytest.raises(ConfigError, match="expected records in"):
         compare.collect_reference()
@@ -222,6 +238,7 @@ def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
     assert experiment is not None
     settings = load(["preset=smoke"])
     tags = {"ablation": "cgp", "preset": "smoke", "seed": "0", "config_sha": settings.sha(), "git_sha": "abc"}
+    tags |= code.tags()
     run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
     for key, value in flatten(settings.tree()).items():
         store.log_param(run_id, key, str(value))
@@ -230,5 +247,6 @@ def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
     store.set_terminated(run_id, "FINISHED")
     (path,) = record.publish("smoke")
     made = Record.read(path)
-    assert (made.run_id, made.metrics, made.origin) == (run_id, {"test/none/num": 10}, {"git_sha": "abc"})
+    assert (made.run_id, made.metrics) == (run_id, {"test/none/num": 10})
+    assert made.origin == {**code.tags(), "git_sha": "abc"}
     assert made.changes == []

@@ -3,9 +3,11 @@ import os
 import shutil
 import signal
 import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mlflow import MlflowClient
 from mlflow.artifacts import list_artifacts
@@ -13,10 +15,12 @@ from mlflow.entities import Run
 from rich.console import Console
 from sqlalchemy import Engine, event
 
-from conflow.experiment import alive, config, resume, signals, tracking
+from conflow.experiment import alive, code, config, resume, signals, tracking
 from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.grid import Cell, _finished
 from conflow.experiment.progress import ProgressDisplay
 from conflow.experiment.record import Record
+from conflow.scene.trajectories import swap
 from tests.conftest import raising_signals
 
 
@@ -343,3 +347,62 @@ def test_a_run_that_goes_on_is_no_longer_said_to_be_gone(note: str, kept: str | 
     with tracking.start(data.config, data, tracking.runs()[0]):
         assert tracking.runs()[0].data.tags.get(alive.NOTE) == kept
     assert tracking.runs()[0].data.tags.get(alive.NOTE) == kept
+
+
+def test_a_run_goes_on_with_other_code_only_where_that_is_asked_for(
+    store_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = DemonstrationData(config.load(["preset=smoke"]))
+    run = interrupted(data)
+    assert run.data.tags["code_sha"] == code.tags()["code_sha"]
+    resume.check(run, data.config, data)
+    monkeypatch.setattr(code, "files", other_correction())
+    with pytest.raises(config.ConfigError, match=r"resume=cgp-s0: found other code in flow/correction.py, .*code=any"):
+        resume.check(run, data.config, data)
+    resume.check(run, data.config, data, any_code=True)
+    with tracking.start(data.config, data, run):
+        pass
+    tags = tracking.runs()[0].data.tags
+    assert tags["code_sha"] not in (run.data.tags["code_sha"], code.tags()["code_sha"]), "it is of neither"
+    assert code.differing(tags) == ["flow/correction.py"]
+    tracking.client().delete_tag(run.info.run_id, "code")  # as a run of before there was it
+    with pytest.raises(config.ConfigError, match="found other code in unknown files"):
+        resume.check(tracking.runs()[0], data.config, data)
+
+
+@pytest.mark.parametrize(("status", "resumes"), [("FINISHED", False), ("KILLED", True)])
+def test_a_grid_knows_its_cells_by_their_code_too(
+    status: str, resumes: bool, store_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = DemonstrationData(config.load(["preset=smoke"]))
+    run = interrupted(data)
+    tracking.client().set_terminated(run.info.run_id, status)
+
+    def seen(any_code: bool) -> tuple[bool, list[str], str]:
+        cell = Cell([], data.config)
+        return _finished(cell, any_code), cell.arguments, cell.again
+
+    again = [f"resume={run.info.run_id}"]
+    assert seen(any_code=False) == (not resumes, again if resumes else [], "")
+    monkeypatch.setattr(code, "files", other_correction())
+    assert seen(any_code=False) == (False, [], "trained by other code: flow/correction.py")
+    assert seen(any_code=True) == (not resumes, [*again, "code=any"] if resumes else [], "")
+    tracking.client().delete_tag(run.info.run_id, "code")
+    assert seen(any_code=False) == (False, [], "trained by other code: unknown files")
+
+
+def test_labels_that_are_inverted_in_the_file_make_another_cell(store_folder: Path) -> None:
+    x, labels = swap(200).numpy(), np.arange(200) % 3 == 0
+    np.savez("mine.npz", x=x, violates=labels)
+    settings = config.load(["preset=smoke", "data.path=mine.npz"])
+    with tracking.start(settings, DemonstrationData(settings)):
+        pass
+    assert _finished(Cell([], settings), any_code=False)
+    np.savez("mine.npz", x=x, violates=~labels)
+    assert not _finished(Cell([], settings), any_code=False)
+
+
+def other_correction() -> Callable[[], Mapping[str, str]]:
+    """`code.files` of a program whose flow/correction.py is another."""
+    files = dict(code.files()) | {"flow/correction.py": "00000000"}
+    return lambda: files

@@ -13,7 +13,7 @@ from conflow.experiment.callbacks import VALIDATION_SAMPLES
 from conflow.experiment.cells import METHODS
 from conflow.experiment.figures.curves import MARK
 from conflow.experiment.figures.front import COLOURS, MARKERS
-from conflow.experiment.record import Record
+from conflow.experiment.record import Record, finished
 
 RATE = 0.016
 """The paper's unguided rate of ConFlow."""
@@ -49,9 +49,9 @@ class Curve:
 
 
 def curves(preset: str) -> list[Curve]:
-    """The newest finished run of every ablation and seed at a preset, of those that counted their seconds."""
+    """The first of the finished runs of every ablation and seed at a preset, of those that counted their seconds."""
     newest: dict[tuple[str, int], Curve] = {}
-    for run in tracking.runs("FINISHED", preset=preset):
+    for run in finished(preset):
         key = run.data.tags["ablation"], int(run.data.tags["seed"])
         if key in newest or key[0] not in config.names("ablation") or "train/seconds" not in run.data.metrics:
             continue

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from conflow.experiment import config, paper, record
+from conflow.experiment import code, config, paper, record
 from conflow.experiment.cells import BASELINE, COLLISIONS, METHODS, Cell, labels, tables
 from conflow.experiment.claims import Claim, claims
 from conflow.experiment.config import ConfigError
@@ -18,6 +18,7 @@ class Comparison:
         commands: what makes a row again, by its name.
         reading: how the paper was read, in settings; rows that were read otherwise say so.
         reasons: why rows differ from the paper's, for those that do.
+        code: which runs are of other code than the present or, of published ones, than the others of their row.
     """
 
     preset: str
@@ -27,10 +28,13 @@ class Comparison:
     commands: dict[str, str]
     reading: str
     reasons: dict[str, str]
+    code: str
 
 
 def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
     """Compare the newest finished run of every ablation and seed at a preset, with arguments as they were trained.
+
+    Where runs of the present code have finished, the newest of these.
 
     Raises:
         ConfigError: there is no such run.
@@ -38,7 +42,8 @@ def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
     records = record.from_store(preset, arguments)
     if not records:
         raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
-    return _comparison(preset, _grouped(records, lambda one: one.ablation), {})
+    rows = _grouped(records, lambda one: one.ablation)
+    return _comparison(preset, rows, {}, _of_other_code(one for of_row in rows.values() for one in of_row))
 
 
 def collect_reference() -> list[Comparison]:
@@ -54,7 +59,8 @@ def collect_reference() -> list[Comparison]:
     for preset in sorted({one.preset for one in records}, key=_scale, reverse=True):
         plain = [one for one in records if one.preset == preset and not one.changes]
         changed = [one for one in records if one.preset == preset and one.changes]
-        found.append(_comparison(preset, _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)))
+        runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
+        found.append(_comparison(preset, runs, readings, _of_different_code(runs | readings)))
     return sorted(found, key=lambda one: not one.claims)
 
 
@@ -78,7 +84,32 @@ def _reading(one: Record) -> str:
     return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join(one.changes)}"
 
 
-def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> Comparison:
+def _of_other_code(records: Iterable[Record]) -> str:
+    """Which of the runs of a store are not of the present code, and in which files they differ."""
+    runs: dict[str, list[str]] = {}
+    for one in records:
+        if files := code.differing(one.origin):
+            runs.setdefault(", ".join(files), []).append(f"{one.ablation}-s{one.seed}")
+    shown = [f"{', '.join(names)} ({files})" for files, names in runs.items()]
+    return f"Trained by other code than the present: {'; '.join(shown)}" if shown else ""
+
+
+def _of_different_code(rows: Mapping[str, list[Record]]) -> str:
+    """Which rows of published runs pool several codes; which of them is the present one does not matter."""
+    shown = []
+    for name, of_row in rows.items():
+        seeds: dict[str, list[str]] = {}
+        for one in of_row:
+            seeds.setdefault(one.origin.get("code_sha", "unknown"), []).append(f"s{one.seed}")
+        if len(seeds) > 1:
+            several = "; ".join(f"{', '.join(those)}: {sha}" for sha, those in seeds.items())
+            shown.append(f"{name} ({several})")
+    return f"Rows of runs by different code: {', '.join(shown)}" if shown else ""
+
+
+def _comparison(
+    preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]], of_code: str
+) -> Comparison:
     cells = tables(runs, readings)
     rows = dict(runs) | dict(readings)
     settings = (rows.get("cgp") or next(iter(rows.values())))[0].settings
@@ -90,6 +121,7 @@ def _comparison(preset: str, runs: Mapping[str, list[Record]], readings: Mapping
         _commands(runs, readings),
         " ".join(f"{key}={settings[key]}" for key in paper.OPEN if key in settings),
         _reasons(cells),
+        of_code,
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from mlflow.entities import Run
 from rich.console import Console
 
-from conflow.experiment import checkpoints, record, report, tracking
+from conflow.experiment import checkpoints, code, record, report, tracking
 from conflow.experiment import config as configuration
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
@@ -71,6 +71,9 @@ def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> N
     """
     run = tracking.find_run(wanted)
     model = load_model(tracking.artifact(run, MODEL_FILE), arguments)
+    if differing := code.differing(run.data.tags):
+        said = f"{run.info.run_name} was trained by other code, and is sampled by the present: {', '.join(differing)}"
+        console.print(said, highlight=False, soft_wrap=True)
     # MLflow allows no = in a metric's name.
     label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or record.UNCHANGED
     data = demonstrations(run, model.config)

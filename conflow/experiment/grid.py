@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from rich.console import Console
 
-from conflow.experiment import config, resume, signals, tracking
+from conflow.experiment import code, config, resume, signals, tracking
 from conflow.experiment.config import Config
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.progress import ProgressDisplay
@@ -25,12 +25,17 @@ STEPS = re.compile(r"^(training|sampling) (\d+)/(\d+)")
 
 @dataclass
 class Cell:
-    """One experiment of the grid: the arguments that ask for it, how far it is, and whether it failed to end well."""
+    """One experiment of the grid: the arguments that ask for it, how far it is, and whether it failed to end well.
+
+    Attributes:
+        again: why it is trained although it was before.
+    """
 
     arguments: list[str]
     config: Config
     share: float = 0.0
     note: str = ""
+    again: str = ""
     failed: bool = True
     output: list[str] = field(default_factory=list)
 
@@ -39,11 +44,27 @@ class Cell:
         return f"{self.config.ablation}-s{self.config.seed}"
 
 
-def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str], jobs: int, console: Console) -> int:
+def run(
+    ablations: Sequence[str],
+    seeds: Sequence[str],
+    arguments: Sequence[str],
+    jobs: int,
+    console: Console,
+    any_code: bool = False,
+) -> int:
     """Train the cells that are not finished yet, `jobs` at a time; the number of cells that failed.
 
-    A cell is finished when MLflow has a FINISHED run of the same config on the same data, so a grid that was stopped
-    goes on where it stopped. Each cell is a process of its own: one that fails leaves the others alone.
+    A cell is finished when MLflow has a FINISHED run of the same config on the same data by the same code, so a grid
+    that was stopped goes on where it stopped. Each cell is a process of its own: one that fails leaves the others
+    alone.
+
+    Args:
+        ablations: by name.
+        seeds: each for every ablation.
+        arguments: further settings of all cells.
+        jobs: how many are trained at once.
+        console: for progress.
+        any_code: take runs of other code as well.
 
     Raises:
         ConfigError: any of the cells cannot be asked for; then none is started.
@@ -53,8 +74,11 @@ def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]
         for seed in seeds
         for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
     ]
-    todo = [cell for cell in cells if not _finished(cell)]
+    todo = [cell for cell in cells if not _finished(cell, any_code)]
     console.print(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before", highlight=False)
+    for cell in todo:
+        if cell.again:
+            console.print(f"{cell.name}: {cell.again}", highlight=False, soft_wrap=True)
     if todo:
         _train_all(todo, jobs, console)
     for cell in todo:
@@ -67,16 +91,21 @@ def run(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]
     return sum(cell.failed for cell in todo)
 
 
-def _finished(cell: Cell) -> bool:
-    """Whether a cell is; if it was interrupted, it is told to go on from there."""
+def _finished(cell: Cell, any_code: bool) -> bool:
+    """Whether a cell is; if it was interrupted, it is told to go on from there, and if by other code, why it is not."""
     try:
         digest = DemonstrationData(cell.config).digest
     except DemonstrationError:
         return False  # the cell itself will say so, and the others go on
-    if tracking.runs("FINISHED", config_sha=cell.config.sha(), data_digest=digest):
+    runs = tracking.runs(config_sha=cell.config.sha(), data_digest=digest)
+    ended = [run for run in runs if run.info.status in ("FINISHED", *resume.INTERRUPTED)]
+    ours = [run for run in ended if any_code or not code.differing(run.data.tags)]
+    if any(run.info.status == "FINISHED" for run in ours):
         return True
-    if interrupted := resume.find_cell(cell.config, digest):
-        cell.arguments.append(f"resume={interrupted}")
+    if ours:
+        cell.arguments += [f"resume={ours[0].info.run_id}", *(["code=any"] if any_code else [])]
+    elif ended:
+        cell.again = f"trained by other code: {', '.join(code.differing(ended[0].data.tags))}"
     return False
 
 

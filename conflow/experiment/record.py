@@ -9,14 +9,14 @@ from pathlib import Path
 
 from mlflow.entities import Run
 
-from conflow.experiment import config, tracking
+from conflow.experiment import code, config, tracking
 from conflow.experiment.config import ConfigError, flatten
 
 FOLDER = tracking.RUNS / "reference" / "runs"
 PUBLISHED = ("test/", "without_model/", "source/", "evaluate/")
 UNCHANGED = "same settings"
 """The label of a run that was sampled again as it is."""
-ORIGIN = ("git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
+ORIGIN = ("code_sha", "code", "git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,15 @@ class Record:
         return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
 
 
+def finished(preset: str) -> list[Run]:
+    """The finished runs at a preset, those of the present code first, the newest of either first."""
+    return sorted(tracking.runs("FINISHED", preset=preset), key=lambda run: bool(code.differing(run.data.tags)))
+
+
 def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
-    """The newest finished run of every ablation and seed at a preset, with arguments as they were trained."""
+    """The first of the `finished` runs of every ablation and seed at a preset, with arguments as they were trained."""
     newest: dict[tuple[str, int], Record] = {}
-    for run in tracking.runs("FINISHED", preset=preset):
+    for run in finished(preset):
         ablation, seed = run.data.tags["ablation"], int(run.data.tags["seed"])
         if ablation not in config.names("ablation"):
             continue
@@ -109,8 +114,8 @@ def from_files() -> list[Record]:
 
 
 def publish(preset: str) -> list[Path]:
-    """Write the newest finished run of every experiment and seed at a preset into runs/reference/."""
+    """Write the first of the `finished` runs of every experiment and seed at a preset into runs/reference/."""
     newest: dict[str, Run] = {}
-    for run in tracking.runs("FINISHED", preset=preset):
+    for run in finished(preset):
         newest.setdefault(run.data.tags["config_sha"], run)
     return [Record.of(run).write(FOLDER) for run in newest.values()]

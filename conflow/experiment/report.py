@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any, Literal, cast, get_args
@@ -90,10 +91,15 @@ def render(comparisons: Sequence[Comparison], form: Format, console: Console) ->
     elif form == "csv":
         cells = [cell for one in comparisons for cell in one.cells]
         console.out(csv_text(Cell, cells), end="", highlight=False)
+        for one in comparisons:
+            if one.code:  # beside the cells, of which it is none
+                print(one.code, file=sys.stderr)
     else:
         for one in comparisons:
             _print_sheets(_sheets(one), form, console)
             console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
+            if one.code:
+                console.out(f"{one.code}\n", highlight=False)
         if len(comparisons) > 1:
             _print_sheets([_overview(comparisons)], form, console)
         console.out(NOTE, highlight=False)

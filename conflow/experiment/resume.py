@@ -2,7 +2,7 @@
 
 from mlflow.entities import Run
 
-from conflow.experiment import tracking
+from conflow.experiment import code, tracking
 from conflow.experiment.config import Config, ConfigError, flatten
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.finished import check_data
@@ -31,15 +31,26 @@ def find(wanted: str) -> Run:
     )
 
 
-def check(run: Run, config: Config, data: DemonstrationData) -> None:
+def check(run: Run, config: Config, data: DemonstrationData, any_code: bool = False) -> None:
     """Refuse to go on with a run as if it were another experiment.
 
+    Args:
+        run: the interrupted run.
+        config: what is asked for.
+        data: its demonstrations.
+        any_code: go on also where the code that trains and measures has changed since.
+
     Raises:
-        ConfigError: the run's config is another; all differences are listed.
+        ConfigError: the run's config or code is another; all differences are listed.
         DemonstrationError: its demonstrations are.
     """
     if run.data.tags["config_sha"] != config.sha():
         raise ConfigError(f"resume={run.info.run_name}: {_differences(run, config)}")
+    if not any_code and (differing := code.differing(run.data.tags)):
+        raise ConfigError(
+            f"resume={run.info.run_name}: found other code in {', '.join(differing)}, expected the run's own; "
+            "to go on all the same: code=any"
+        )
     check_data(run, data)
 
 
@@ -49,11 +60,3 @@ def _differences(run: Run, config: Config) -> str:
     different = [key for key in own | asked if own.get(key) != asked.get(key)]
     found, expected = (", ".join(f"{key}={values.get(key, 'none')}" for key in different) for values in (asked, own))
     return f"found {found}, expected the run's own {expected}"
-
-
-def find_cell(config: Config, digest: str) -> str | None:
-    """The id of the newest interrupted run of this very experiment, if there is one."""
-    for run in tracking.runs(config_sha=config.sha(), data_digest=digest):
-        if run.info.status in INTERRUPTED:
-            return str(run.info.run_id)
-    return None

@@ -26,7 +26,7 @@ from mlflow.entities import DatasetInput, InputTag, Metric, Param, Run
 from mlflow.exceptions import MlflowException
 
 from conflow import __version__
-from conflow.experiment import alive, signals
+from conflow.experiment import alive, code, signals
 from conflow.experiment.config import Config, ConfigError, flatten, nearest
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.signals import held
@@ -302,7 +302,7 @@ def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
         if store.get_run(run_id).info.status == "RUNNING":
             raise ConfigError(f"resume={run.info.run_name}: expected an interrupted run, found one that is RUNNING")
         again = {"pid": str(os.getpid()), "resumed": str(int(run.data.tags.get("resumed", 0)) + 1)}
-        for key, value in (lock | again).items():
+        for key, value in (lock | again | code.tags_after(run.data.tags)).items():
             store.set_tag(run_id, key, value)
         if run.data.tags.get(alive.NOTE) == alive.GONE:  # no longer true of it
             store.delete_tag(run_id, alive.NOTE)
@@ -352,6 +352,7 @@ def _tags(config: Config, data: DemonstrationData) -> dict[str, str]:
         **{f"data_{split}": str(len(getattr(data, split).x)) for split in ("train", "val", "test")},
         "pid": str(os.getpid()),
         "seconds": "0",
+        **code.tags(),
         **origin(),
     }
 

@@ -22,17 +22,18 @@ from conflow.experiment.module import ConFlow, DivergedError
 from conflow.experiment.progress import ProgressDisplay
 
 
-def train(config: Config, console: Console, wanted: str = "") -> str:
+def train(config: Config, console: Console, wanted: str = "", any_code: bool = False) -> str:
     """Train, sample, evaluate and log one experiment; the id of its run.
 
     Args:
         config: the experiment.
         console: for progress and results.
         wanted: an interrupted run of this experiment to go on with: its id, NAME, PRESET/NAME, or "latest".
+        any_code: go on with it also where other code began it.
 
     Raises:
         DemonstrationError: before anything is tracked.
-        ConfigError: there is no such run, or it is of another experiment.
+        ConfigError: there is no such run, or it is of another experiment or of other code.
         CheckpointError: a checkpoint could not be written.
         DivergedError: a loss or gradient was not finite.
     """
@@ -41,7 +42,7 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
     model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
     model.fit(data.train.feasible().x)
     interrupted = resume.find(wanted) if wanted else None
-    checkpoint = _continued(interrupted, config, data, console) if interrupted else None
+    checkpoint = _continued(interrupted, config, data, console, any_code) if interrupted else None
     with tracking.start(config, data, interrupted) as logger:
         run_id = str(logger.run_id)
         if config.source.fit:
@@ -72,9 +73,9 @@ def train(config: Config, console: Console, wanted: str = "") -> str:
     return run_id
 
 
-def _continued(run: Run, config: Config, data: DemonstrationData, console: Console) -> Path | None:
+def _continued(run: Run, config: Config, data: DemonstrationData, console: Console, any_code: bool) -> Path | None:
     """The checkpoint from which a run goes on, or None from its beginning."""
-    resume.check(run, config, data)
+    resume.check(run, config, data, any_code)
     path, step, refused = checkpoints.newest(tracking.checkpoints(str(run.info.run_id)))
     for reason in refused:
         console.print(f"{reason}; going on from the one before it", highlight=False, soft_wrap=True)

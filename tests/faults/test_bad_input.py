@@ -385,6 +385,8 @@ OPTIONS = [
     (("compare", "preset=it's"), "preset=it's: expected one of long, paper, quick, smoke"),
     (("compare", "preset=paper"), "preset=paper: no run at this preset has finished"),
     (("compare", "train.lr=fast"), f"train.lr=fast: {FINITE}"),
+    (("train", "preset=smoke", "code=some"), "code=some: expected same or any"),
+    (("ablations", "preset=smoke", "code="), "code=: expected same or any"),
     (("figures", "run=nobody"), "run=nobody: no such finished run, expected"),
     (("figures", "rnu=latest"), "rnu: no such option, expected run; did you mean run?"),
     (("explain", "preset=quik"), "preset=quik: expected one of long, paper, quick, smoke; did you mean quick?"),

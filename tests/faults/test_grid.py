@@ -1,12 +1,16 @@
 """A grid that is interrupted, and one of whose cells fails."""
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
+import conflow
 from conflow.scene.constraint import RobotAvoidance
 from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import swap
@@ -54,6 +58,34 @@ def test_a_cell_that_died_as_it_was_begun_goes_on_as_the_same_run(tmp_path: Path
     code, said = processes.run(tmp_path, "ablations", "preset=smoke", "seeds=0", "ablations=fm")
     assert code == 0, said
     assert statuses(tmp_path) == [("fm-s0", "FINISHED")]
+
+
+def test_changed_code_is_trained_anew_and_a_changed_comment_is_not(tmp_path: Path) -> None:
+    """A sign that is flipped in the method, in a copy of the program."""
+    root = Path(conflow.__file__).parents[1]
+    for part in ("conflow", "conf"):
+        shutil.copytree(root / part, tmp_path / part)
+    correction = tmp_path / "conflow" / "flow" / "correction.py"
+    text = correction.read_text()
+    assert text.count("return (self") == 1
+    flipped = text.replace("return (self", "return -(self")
+    expected = {
+        text: ["1 cells, 0 of them finished before"],
+        f"# A comment.\n{text}": ["1 cells, 1 of them finished before"],
+        flipped: ["1 cells, 0 of them finished before", "cgp-s0: trained by other code: flow/correction.py"],
+        text.replace("u^c", "the correction"): ["1 cells, 1 of them finished before"],  # the first run is still there
+    }
+    grid = [sys.executable, "-m", "conflow", "ablations", "preset=smoke", "seeds=0", "ablations=cgp"]
+    environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
+    environment["PYTHONPATH"] = str(tmp_path)
+    for content, said in expected.items():
+        correction.write_text(content)
+        done = subprocess.run(grid, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        assert [line.rstrip() for line in done.stdout.splitlines()[: len(said)]] == said
+        assert "other code than the present" not in done.stdout
+    old, new = (run.data.metrics["train/loss"] for run in runs(tmp_path))
+    assert old != new
 
 
 def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
