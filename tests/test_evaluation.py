@@ -12,7 +12,7 @@ from torch import Tensor
 
 from conflow.experiment import config, report
 from conflow.experiment.datamodule import DemonstrationData, Split
-from conflow.experiment.evaluation import Evaluation, evaluate
+from conflow.experiment.evaluation import Evaluation, cycle, evaluate
 from conflow.experiment.module import SETTINGS, ConFlow
 from conflow.experiment.progress import ProgressDisplay
 from conflow.experiment.train import trainer
@@ -89,9 +89,24 @@ def test_every_setting_and_baseline_has_the_guards(evaluation: Evaluation) -> No
 
 
 def test_demonstrations_succeed_where_they_do_not_collide(evaluation: Evaluation) -> None:
+    """Of these none passes between two waypoints what it does not pass at them."""
     data, feasible = evaluation.baseline["data"], evaluation.baseline["feasible"]
     assert data["success_count"] == feasible["num"] == int((~violates(swap(200))).sum())
     assert (feasible["success_rate"], feasible["robot_collision_rate"], feasible["outside_rate"]) == (1, 0, 0)
+
+
+def test_success_around_the_obstacle_misses_the_obstacle_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a flow that returns the demonstrations themselves, which reach their own starts and goals."""
+    x = swap(200)
+    x_1 = cycle(x, 64)
+    monkeypatch.setattr(ConFlow, "flow", lambda *_: x_1)
+    found = evaluated(x)
+    apart = model().robots.swept_clearance(x_1).amin(dim=1) >= 0
+    free = model().obstacle.swept_clearance(x_1).amin(dim=1) >= 0
+    succeed = {setting: found.results[setting]["success_count"] for setting in SETTINGS}
+    assert succeed == {"none": apart.sum(), "robot": apart.sum(), "obstacle": (apart & free).sum()}
+    assert 0 < succeed["obstacle"] < succeed["none"] < 64
+    assert found.baseline["data"]["success_count"] > succeed["none"]  # of all 200, without the obstacle
 
 
 def test_the_feasible_demonstrations_have_no_distance_to_themselves(evaluation: Evaluation) -> None:

@@ -27,7 +27,7 @@ from conflow.experiment.metrics import (
     trajectory_metrics,
     wilson,
 )
-from conflow.scene.constraint import Obstacle, ObstacleAvoidance, RobotAvoidance
+from conflow.scene.constraint import Obstacle, ObstacleAvoidance, RobotAvoidance, Sum
 from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import swap
 
@@ -183,9 +183,17 @@ def within_tolerance(x: Tensor) -> None:
     x[0, 0, 0] += 0.019
 
 
+def crossing_between_waypoints(x: Tensor) -> None:
+    """The robots change sides in one step: far apart before and after, through each other in between."""
+    x[0, 1, 1], x[0, 1, 3] = x[0, 1, 3].clone(), x[0, 1, 1].clone()
+
+
 @pytest.mark.parametrize(
     ("spoil", "count"),
-    [(within_tolerance, 1), (touching, 0), (outside, 0), (late_start, 0), (missed_goal, 0), (lost, 0)],
+    [
+        *((within_tolerance, 1), (touching, 0), (outside, 0), (late_start, 0), (missed_goal, 0), (lost, 0)),
+        (crossing_between_waypoints, 0),
+    ],
 )
 def test_success_takes_all_of_it(spoil: Callable[[Tensor], None], count: int) -> None:
     x_1, x = parallel(0.5), parallel(0.5)
@@ -193,6 +201,21 @@ def test_success_takes_all_of_it(spoil: Callable[[Tensor], None], count: int) ->
     metric = SuccessRate("success", ROBOTS)
     metric.update(x, x_1)
     assert metric.compute()["success_count"] == count
+
+
+def test_no_trajectory_both_succeeds_around_the_obstacle_and_hits_it() -> None:
+    """What succeeds with the obstacle to keep succeeds without it and never touches it on its straight lines."""
+    x = swap(300, seed=1)
+    alone, around = (trajectory_metrics(ROBOTS, OBSTACLE, None, kept) for kept in (ROBOTS, Sum([ROBOTS, OBSTACLE])))
+    free = OBSTACLE.swept_clearance(x).amin(dim=1) >= 0
+    for each in (alone, around):
+        each.update(x=x, x_1=x)
+    found = around.compute()
+    assert found["success_rate"] + found["object_collision_rate"] <= 1
+    apart = trajectory_metrics(ROBOTS, OBSTACLE, None, ROBOTS)
+    apart.update(x=x[free], x_1=x[free])
+    assert found["success_count"] == apart.compute()["success_count"]
+    assert 0 < found["success_count"] < alone.compute()["success_count"]
 
 
 def distances(x: Tensor, y: Tensor) -> list[float]:
@@ -296,7 +319,7 @@ def test_intervals_enclose_their_estimates_and_shrink_with_the_root_of_the_count
 def test_metrics_do_not_depend_on_how_the_trajectories_were_split_over_batches() -> None:
     x, x_1 = swap(300, seed=1), swap(300, seed=2)
     reference = swap(200, seed=3)
-    whole, parts = (trajectory_metrics(ROBOTS, OBSTACLE, reference) for _ in range(2))
+    whole, parts = (trajectory_metrics(ROBOTS, OBSTACLE, reference, ROBOTS) for _ in range(2))
     whole.update(x=x, x_1=x_1)
     for a, b in zip(x.split([1, 99, 200]), x_1.split([1, 99, 200]), strict=True):
         parts.update(x=a, x_1=b)
@@ -308,7 +331,7 @@ def test_metrics_do_not_depend_on_how_the_trajectories_were_split_over_batches()
 
 def test_without_a_reference_there_is_no_energy_distance_and_all_else() -> None:
     x = swap(50, seed=1)
-    without, with_one = (trajectory_metrics(ROBOTS, OBSTACLE, reference) for reference in (None, x))
+    without, with_one = (trajectory_metrics(ROBOTS, OBSTACLE, reference, ROBOTS) for reference in (None, x))
     for each in (without, with_one):
         each.update(x=x, x_1=x)
     left_out = with_one.compute().keys() - without.compute().keys()

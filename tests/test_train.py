@@ -105,7 +105,7 @@ def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Ru
     x_1, reference = test[torch.arange(64) % 50], test[~model.robots.violation(test)]
     for setting in SETTINGS:
         x = model.sample(x_1, setting, random_stream("test samples", 3))
-        metrics = trajectory_metrics(model.robots, model.obstacle, reference)
+        metrics = trajectory_metrics(model.robots, model.obstacle, reference, model.required(setting))
         metrics.update(x=x, x_1=x_1)
         for key, value in metrics.compute().items():
             # To the bit but for the order of sums: training and test may run on other numbers of threads.

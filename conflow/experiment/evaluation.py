@@ -75,17 +75,17 @@ def evaluate(model: ConFlow, split: Split, display: ProgressDisplay) -> Evaluati
             for name, waypoint in {"start": 0, "end": -1}.items()
         }
         latency = {"latency_ms": _latency_ms(model, x_1, setting)}
-        evaluation.results[setting] = measure(model, x, x_1, reference) | drift | latency
+        evaluation.results[setting] = measure(model, x, x_1, reference, setting) | drift | latency
         display.update(task, done, f"setting {setting}")
     return evaluation
 
 
-def measure(model: ConFlow, x: Tensor, x_1: Tensor, reference: Tensor | None) -> Metrics:
+def measure(model: ConFlow, x: Tensor, x_1: Tensor, reference: Tensor | None, setting: Setting = "none") -> Metrics:
     """The metrics of trajectories x whose starts and goals were those of x_1, both (num, T, D).
 
-    With the energy distance to a reference (m, T, D) where there is one.
+    With the energy distance to a reference (m, T, D) where there is one; success is to keep what the setting asks for.
     """
-    metrics = trajectory_metrics(model.robots, model.obstacle, reference).to(model.device)
+    metrics = trajectory_metrics(model.robots, model.obstacle, reference, model.required(setting)).to(model.device)
     for piece, demonstrated in zip(x.split(PIECE), x_1.split(PIECE), strict=True):
         metrics.update(x=piece, x_1=demonstrated)
     return metrics.compute() | {"num": len(x)}

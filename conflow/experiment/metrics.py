@@ -78,6 +78,11 @@ def leaves_workspace(x: Tensor) -> Tensor:
     return ~(x.abs().flatten(1).amax(dim=1) <= 1)
 
 
+def keeps(constraint: Constraint, x: Tensor) -> Tensor:
+    """Whether x keeps a constraint on the straight lines between its waypoints too, boolean (batch,)."""
+    return constraint.swept_clearance(x).amin(dim=1) >= 0
+
+
 def endpoint_error(x: Tensor, x_1: Tensor, waypoint: int) -> Tensor:
     """Mean over robots of the distance between x and x_1 (batch, T, D) at a waypoint, (batch,)."""
     return torch.linalg.vector_norm(_positions(x - x_1)[:, waypoint], dim=2).mean(dim=1)
@@ -158,7 +163,7 @@ class SweptCollisionRate(CollisionRate):
     """As `CollisionRate`, with the robots on straight lines between the waypoints, which see a crossing there too."""
 
     def update(self, x: Tensor) -> None:
-        self.add(~(self.constraint.swept_clearance(x).amin(dim=1) >= 0))
+        self.add(~keeps(self.constraint, x))
 
 
 class OutsideRate(_Rate):
@@ -169,9 +174,10 @@ class OutsideRate(_Rate):
 
 
 class SuccessRate(_Rate):
-    """Fraction of trajectories without a violation that stay in the workspace and reach the start and goal of x_1.
+    """Fraction of trajectories that keep the constraint, stay in the workspace and reach the start and goal of x_1.
 
-    No collision rate can be bought here by going elsewhere or nowhere.
+    The constraint is kept on the straight lines between the waypoints too. No collision rate can be bought here by
+    going elsewhere or nowhere.
     """
 
     def __init__(self, name: str, constraint: Constraint) -> None:
@@ -180,7 +186,7 @@ class SuccessRate(_Rate):
 
     def update(self, x: Tensor, x_1: Tensor) -> None:
         reached = (endpoint_error(x, x_1, 0) <= REACHED) & (endpoint_error(x, x_1, -1) <= REACHED)
-        self.add(reached & ~leaves_workspace(x) & ~self.constraint.violation(x))
+        self.add(reached & ~leaves_workspace(x) & keeps(self.constraint, x))
 
 
 class _Values(Metric):
@@ -307,19 +313,22 @@ class EnergyDistance(_Values):
         }
 
 
-def trajectory_metrics(robots: Constraint, obstacle: Constraint, reference: Tensor | None) -> MetricCollection:
+def trajectory_metrics(
+    robots: Constraint, obstacle: Constraint, reference: Tensor | None, kept: Constraint
+) -> MetricCollection:
     """All metrics of generated trajectories x against the demonstrations x_1 whose starts and goals they were given.
 
     Args:
         robots: the constraint that samples without a collision satisfy.
         obstacle: the constraint that appears at inference alone.
         reference: feasible demonstrations that were held out, (m, T, D), for the energy distance; None leaves it out.
+        kept: the constraint that a trajectory must keep to succeed.
     """
     metrics: dict[str, Metric | MetricCollection] = {
         "robot_collision": CollisionRate("robot_collision", robots),
         "object_collision": CollisionRate("object_collision", obstacle),
         "robot_collision_swept": SweptCollisionRate("robot_collision_swept", robots),
-        "success": SuccessRate("success", robots),
+        "success": SuccessRate("success", kept),
         "outside": OutsideRate("outside"),
         "smoothness": Smoothness(),
         # What the paper calls smoothness it does not say; these are other readings, under their own names.

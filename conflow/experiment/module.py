@@ -26,6 +26,7 @@ from conflow.flow.correction import Correction
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import end, guided_path, interpolate, velocity
 from conflow.flow.sampler import GUIDANCE, Field, in_pieces, integrate
+from conflow.scene.constraint import Constraint, Sum
 
 Setting = Literal["none", "robot", "obstacle"]
 SETTINGS: tuple[Setting, ...] = get_args(Setting)
@@ -95,6 +96,10 @@ class ConFlow(LightningModule):
             assert isinstance(self.v, SpectralMLP)  # the config was checked
             v, u = self.v.balanced(v), self.v.balanced(u)
         return F.mse_loss(v, u)
+
+    def required(self, setting: Setting) -> Constraint:
+        """All that trajectories of a setting must keep: the obstacle stands there in its own setting alone."""
+        return Sum([self.robots, self.obstacle]) if setting == "obstacle" else self.robots
 
     def field(self, setting: Setting, ends: Tensor | None = None) -> Field:
         """The velocity field of a setting, for starts and goals (batch, 2, D) where the network sees them."""
