@@ -8,6 +8,8 @@ ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
 JOBS     ?= 1
 RUN      ?= latest
 KIND     ?= passing
+# What results are shown of: methods and settings are chosen by val, and reported by test.
+SPLIT    ?= val
 FORMAT   ?= table
 REFERENCE ?=
 START    ?=
@@ -33,17 +35,17 @@ help:  ## List what can be made
 	@echo "  Ablations: $(basename $(notdir $(wildcard conf/ablation/*.yaml)))"
 	@echo "  Presets:   $(basename $(notdir $(wildcard conf/preset/*.yaml)))"
 
-train: .venv/installed  ## Train, sample, evaluate and track one experiment: ABLATION= SEED= PRESET= ARGS=
-	@$(CONFLOW) train ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) $(ARGS)
+train: .venv/installed  ## Train, sample, evaluate and track one experiment: ABLATION= SEED= PRESET= SPLIT= ARGS=
+	@$(CONFLOW) train ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) split=$(SPLIT) $(ARGS)
 
-ablations: .venv/installed  ## Train every ablation for every seed, and compare: SEEDS= ABLATIONS= PRESET= JOBS= ARGS=
-	@$(CONFLOW) ablations seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) $(ARGS)
+ablations: .venv/installed  ## Train every ablation for every seed, and compare: SEEDS= ABLATIONS= PRESET= JOBS= SPLIT= ARGS=
+	@$(CONFLOW) ablations seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) split=$(SPLIT) $(ARGS)
 
-evaluate: .venv/installed  ## Sample a finished run again with other settings: RUN= ARGS="sample.steps=50 seed=1"
-	@$(CONFLOW) evaluate run=$(RUN) $(ARGS)
+evaluate: .venv/installed  ## Sample a finished run again with other settings: RUN= SPLIT=val|test ARGS="sample.steps=50"
+	@$(CONFLOW) evaluate run=$(RUN) split=$(SPLIT) $(ARGS)
 
-compare: .venv/installed  ## Print the paper's tables and claims: PRESET= FORMAT=table|markdown|csv|json REFERENCE=1 (published runs)
-	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(if $(REFERENCE),reference=1) $(ARGS)
+compare: .venv/installed  ## Print the paper's tables and claims: PRESET= SPLIT=val|test FORMAT=table|markdown|csv|json REFERENCE=1 (published runs)
+	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(if $(REFERENCE),reference=1,split=$(SPLIT)) $(ARGS)
 
 reference: .venv/installed  ## Publish the numbers of finished runs as files in runs/reference/runs/: PRESET=
 	@$(CONFLOW) reference preset=$(PRESET)
@@ -51,8 +53,8 @@ reference: .venv/installed  ## Publish the numbers of finished runs as files in 
 sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= SEED= ARGS="obstacle=x,y,r"
 	@$(CONFLOW) sample run=$(RUN) start="$(START)" goal="$(GOAL)" $(WRITTEN) seed=$(SEED) $(ARGS)
 
-figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,...
-	@$(CONFLOW) figures run=$(RUN)
+figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,... SPLIT=
+	@$(CONFLOW) figures run=$(RUN) split=$(SPLIT)
 
 explain: .venv/installed  ## Draw why the covariant correction works, and what fewer collisions cost: PRESET=
 	@$(CONFLOW) explain preset=$(PRESET)

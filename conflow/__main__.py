@@ -15,31 +15,34 @@ if TYPE_CHECKING:
 
 
 def train(arguments: list[str]) -> None:
-    """Train, sample, evaluate and track one experiment, or go on with an interrupted one: resume=RUN, code=any."""
+    """Train, sample, evaluate and track one experiment, split=val to print; or go on with one: resume=RUN, code=any."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
     # First of all, and with little imported, so that a mistyped setting is answered at once.
-    options, rest = config.options(arguments, {"resume": "", "code": "same"})
-    any_code = _any_code(options)
+    options, rest = config.options(arguments, {"resume": "", "code": "same", "split": "val"})
+    any_code, split = _any_code(options), config.held_out(options)
     settings = config.load(rest)
     config.check_training(settings)
 
     from conflow.experiment.train import train
 
     console = _console()
-    run_id = train(settings, console, options["resume"], any_code)
+    run_id = train(settings, console, options["resume"], any_code, split)
     console.print(f"Run {run_id} is finished. Look at it with: make ui", highlight=False)
 
 
 def ablations(arguments: list[str]) -> None:
-    """Train every ablation for every seed, what is not finished yet, and compare: seeds="0 1 2" ablations= jobs=1."""
+    """Train every ablation for every seed, what is not finished yet, and compare: seeds="0 1 2" ablations= jobs=1.
+
+    Methods are chosen by the validation split: split=val.
+    """
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
     defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
-    options, settings = config.options(arguments, defaults | {"code": "same"})
-    any_code = _any_code(options)
+    options, settings = config.options(arguments, defaults | {"code": "same", "split": "val"})
+    any_code, split = _any_code(options), config.held_out(options)
     jobs = config.whole(options, "jobs", 1, 1024)
     for key in ("seeds", "ablations"):
         if not options[key].split():
@@ -51,7 +54,7 @@ def ablations(arguments: list[str]) -> None:
 
     console = _console()
     failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console, any_code)
-    report.render([compare.collect(options["preset"], settings)], "table", console)
+    report.render([compare.collect(options["preset"], settings, split)], "table", console)
     if failed:
         raise config.ConfigError(f"{failed} cells failed; the same command tries them again")
 
@@ -66,27 +69,32 @@ def _any_code(options: "Mapping[str, str]") -> bool:
 
 
 def evaluate(arguments: list[str]) -> None:
-    """Sample a finished run again with other settings, and add the results to it: run=latest sample....= seed=."""
+    """Sample a finished run again with other settings, and add the results: run=latest split=val sample....= seed=."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
-    options, settings = config.options(arguments, {"run": "latest"})
+    options, settings = config.options(arguments, {"run": "latest", "split": "val"})
+    split = config.held_out(options)
 
     from conflow.experiment.finished import evaluate_again
 
-    evaluate_again(options["run"], settings, _console())
+    evaluate_again(options["run"], settings, split, _console())
 
 
 def compare(arguments: list[str]) -> None:
-    """Print the paper's tables and claims from finished runs: preset=quick format=table; reference=1: published."""
+    """Print tables and claims of finished runs: preset=quick split=val format=table; reference=1: published ones."""
     from conflow.experiment import compare, config, report
 
-    options, settings = config.options(arguments, {"preset": "quick", "format": "table", "reference": "0"})
+    options, settings = config.options(arguments, {"preset": "quick", "format": "table", "reference": "0", "split": ""})
     of_record = bool(config.whole(options, "reference", 0, 1))
+    options["split"] = options["split"] or ("test" if of_record else "val")
+    split = config.held_out(options)
+    if of_record and split != "test":
+        raise config.ConfigError(f"split={split}: expected test with reference=1, which is what records publish")
     config.load([f"preset={options['preset']}", *settings])  # of a mistyped one there are no runs either
 
     form = report.checked_format(options["format"])
-    found = compare.collect_reference() if of_record else [compare.collect(options["preset"], settings)]
+    found = compare.collect_reference() if of_record else [compare.collect(options["preset"], settings, split)]
     report.render(found, form, _console())
 
 
@@ -123,15 +131,16 @@ def sample(arguments: list[str]) -> None:
 
 
 def figures(arguments: list[str]) -> None:
-    """Draw the pictures of finished runs into runs/figures/: run=latest, or run=NAME,NAME,... to compare them too."""
+    """Draw the pictures of finished runs into runs/figures/: split=val, run=latest, or NAME,NAME,... to compare too."""
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
-    options, _ = config.options(arguments, {"run": "latest"}, settings=False)
+    options, _ = config.options(arguments, {"run": "latest", "split": "val"}, settings=False)
+    split = config.held_out(options)
 
     from conflow.experiment.figures import gallery
 
-    gallery.draw(options["run"].split(","), _console())
+    gallery.draw(options["run"].split(","), split, _console())
 
 
 def explain(arguments: list[str]) -> None:

@@ -3,7 +3,7 @@ import io
 import json
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import get_args
@@ -19,8 +19,10 @@ from conflow.experiment.compare import Comparison
 from conflow.experiment.config import ConfigError
 from conflow.experiment.metrics import wilson
 from conflow.experiment.seeds import LEVEL, holm, rate_interval
+from tests.conftest import Command
 
-GROUPS = ("test/none", "test/robot", "test/obstacle", *(f"without_model/{of}" for of in ("data", "feasible", "source")))
+MEASURED = tuple(f"{split}/{setting}" for split in ("test", "validation") for setting in ("none", "robot", "obstacle"))
+GROUPS = (*MEASURED, *(f"without_model/{of}" for of in ("data", "feasible", "source")))
 RATES = ("robot_collision", "object_collision", "success", "outside")
 OTHERS = {key.rsplit("/", 1)[1] for key in (*QUALITIES, *GUARDS)} - {*RATES}
 
@@ -34,8 +36,9 @@ def add_run(
     status: str = "FINISHED",
     lacking: tuple[str, ...] = (),
     by: Mapping[str, str] | None = None,
+    groups: Sequence[str] = GROUPS,
 ) -> str:
-    """A run as training leaves it, with the same count of 1,000 trajectories in every setting.
+    """A run as training leaves it, with the same count of 1,000 trajectories in every setting, one more on test.
 
     It was logged before there were the metrics that it is `lacking`, `by` the code of these tags or the present one.
     """
@@ -47,11 +50,12 @@ def add_run(
     tags |= code.tags() if by is None else by
     run_id = store.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
     values: dict[str, float] = {}
-    for group in GROUPS:
+    for group in groups:
         values |= {f"{group}/num": 1000}
         values |= {f"{group}/{name}_count": counts for name in RATES if name not in lacking}
         values |= {f"{group}/{name}": quality for name in OTHERS if name not in lacking}
     values.pop("without_model/feasible/energy_distance", None)
+    values |= {key: value + 1 for key, value in values.items() if key.startswith("test/") and key.endswith("_count")}
     store.log_batch(run_id, metrics=[Metric(key, value, 0, 0) for key, value in values.items()])
     store.set_terminated(run_id, status)
     return str(run_id)
@@ -256,7 +260,7 @@ def test_a_claim_on_a_metric_that_a_run_lacks_says_so(patchy: Comparison) -> Non
     claims = {claim.text: claim for claim in patchy.claims}
     found = claims["CGP beats Gaussian: smoothness, median"]
     assert (found.verdict, found.p) == ("no runs", None)
-    assert found.detail == "not all runs of cgp and gaussian have test/none/smoothness_median"
+    assert found.detail == "not all runs of cgp and gaussian have none/smoothness_median"
     assert claims["CGP beats Gaussian: start error per robot"].verdict != "no runs"
 
 
@@ -319,3 +323,42 @@ def test_runs_of_the_present_code_come_before_newer_ones_and_others_are_named(
     for form in get_args(report.Format):
         assert said in rendered(found, form) + capsys.readouterr().err
     assert len(list(csv.reader(io.StringIO(rendered(found, "csv"))))[-1]) == len(fields(Cell)), "cells alone"
+
+
+def test_each_split_is_compared_for_itself_and_named_in_every_title(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    for seed in range(2):
+        add_run("cgp", seed, 20, 0.01)
+        add_run("fm", seed, 40, 0.01)
+    for (split, name), count in zip(config.SPLITS.items(), (40, 42), strict=True):
+        found = compare.collect("smoke", split=split)
+        assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").count == count
+        text = rendered(found, "markdown")
+        titles = [line for line in text.splitlines() if line.startswith("**")]
+        assert len(titles) == 5
+        assert all(title.endswith(f", {name} split**") for title in titles)
+        assert ("Rows without a model are of the test split." in text) == (split == "val")
+
+
+def test_runs_that_were_not_measured_on_a_split_are_left_out_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    add_run("cgp", 0, 20, 0.01, groups=["test/none"])
+    with pytest.raises(ConfigError, match=r"no finished run was measured on the validation split.*split=test"):
+        compare.collect("smoke")
+    assert compare.collect("smoke", split="test").left_out == []
+    add_run("cgp", 1, 30, 0.01)
+    found = compare.collect("smoke")
+    assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").seeds == 1
+    assert "Not measured on the validation split, and left out: cgp-s0; try: split=test" in rendered(found, "table")
+
+
+def test_records_are_compared_on_test_alone(conflow: Command) -> None:
+    result = conflow("compare", "reference=1", "split=val")
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
+    assert "split=val: expected test with reference=1" in result.stderr

@@ -52,6 +52,18 @@ def test_without_negatives_training_and_validation_see_feasible_demonstrations_a
     assert torch.equal(feasible.test.x, mixed.test.x)
 
 
+@pytest.mark.parametrize("ablation", ["fm", "repair"])
+def test_every_ablation_is_measured_on_the_same_starts_and_goals(ablation: str) -> None:
+    """Also where validation of the loss sees D+ alone, or D- moved out of collision."""
+    mixed, other = (DemonstrationData(config.load(["preset=smoke", f"ablation={a}"])) for a in ("cgp", ablation))
+    for name in config.SPLITS:
+        assert torch.equal(other.held_out[name].x, mixed.held_out[name].x)
+        assert torch.equal(other.held_out[name].violates, mixed.held_out[name].violates)
+        assert mixed.held_out[name].violates.any()
+    assert rows(mixed.held_out["val"]) == rows(mixed.val)
+    assert rows(other.held_out["val"]) != rows(other.val)
+
+
 def test_batches_are_a_function_of_seed_and_step_and_resume_where_they_stopped(smoke: Config) -> None:
     split = DemonstrationData(smoke).train
     whole = [x for x, _ in Batches(split, 16, 6, seed=3)]

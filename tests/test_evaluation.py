@@ -109,6 +109,17 @@ def test_success_around_the_obstacle_misses_the_obstacle_too(monkeypatch: pytest
     assert found.baseline["data"]["success_count"] > succeed["none"]  # of all 200, without the obstacle
 
 
+def test_the_splits_have_noise_of_their_own_and_the_latencies_in_common(evaluation: Evaluation) -> None:
+    x = swap(200)
+    with ProgressDisplay(Console(file=io.StringIO())) as display:
+        found = evaluate(model(), Split(x, violates(x)), display, "val", timed=evaluation)
+    assert not torch.equal(found.source_samples, evaluation.source_samples)  # for the same starts and goals
+    assert found.baseline == {}
+    for setting in SETTINGS:
+        assert found.results[setting].keys() == evaluation.results[setting].keys()
+        assert found.results[setting]["latency_ms"] == evaluation.results[setting]["latency_ms"]
+
+
 def test_the_feasible_demonstrations_have_no_distance_to_themselves(evaluation: Evaluation) -> None:
     assert "energy_distance" not in evaluation.baseline["feasible"]
     assert "without_model/feasible/robot_collision_rate" in evaluation.keyed()

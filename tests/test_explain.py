@@ -281,7 +281,7 @@ def published(preset: str, *rates: tuple[str, int, float | None]) -> Comparison:
     for method, count, distance in rates:
         rate = Cell("3", method, RATE, None, count / 1000, None, None, 0, 1, 0, 1, 1, count, 1000, preset, None)
         cells += [rate] if distance is None else [rate, replace(rate, column=DISTANCE, value=distance)]
-    return Comparison(preset, cells, [Claim("", "no runs", None, None, None, "")], {}, {}, "", {}, "")
+    return Comparison(preset, cells, [Claim("", "no runs", None, None, None, "")], {}, {}, "", {}, "", "test", [])
 
 
 def test_the_front_has_a_point_for_each_method_and_preset() -> None:

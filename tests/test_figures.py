@@ -18,9 +18,10 @@ from torch import Tensor
 from conflow.experiment import config, figures, tracking
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.diagnostics import guidance
-from conflow.experiment.evaluation import Evaluation
+from conflow.experiment.evaluation import Evaluation, cycle
 from conflow.experiment.figures import curves, gallery, workspace
 from conflow.experiment.figures.animation import animation, frames
+from conflow.experiment.finished import demonstrations
 from conflow.experiment.metrics import smoothness, wilson
 from conflow.experiment.module import SETTINGS, ConFlow
 from conflow.flow.sampler import integrate
@@ -40,7 +41,7 @@ def data() -> DemonstrationData:
 @pytest.fixture(scope="module")
 def evaluation(data: DemonstrationData) -> Evaluation:
     """Samples of an untrained model: those of the source, about, of which some collide."""
-    return gallery.sample(model("sample.robot_weight=2"), data)
+    return gallery.sample(model("sample.robot_weight=2"), cycle(data.test.x, 512))
 
 
 def lines(axis: Axes) -> Tensor:
@@ -100,7 +101,7 @@ def test_the_sources_panel_shows_the_source_and_the_other_what_became_of_it(eval
 
 def test_the_page_judges_each_setting_by_what_it_avoids(data: DemonstrationData, evaluation: Evaluation) -> None:
     flow = model()
-    axes = {axis.get_title().split("\n")[0]: axis for axis in figures.page(flow, data, evaluation).axes}
+    axes = {axis.get_title().split("\n")[0]: axis for axis in figures.page(flow, data, evaluation, "test").axes}
     for setting in ("none", "robot"):
         count = int((distance(evaluation.samples[setting]).amin(dim=1) < 0.3).sum())
         assert f"\n{count} of 512 " in axes[workspace.TITLES[setting]].get_title()
@@ -115,6 +116,17 @@ def test_the_page_judges_each_setting_by_what_it_avoids(data: DemonstrationData,
     assert [(circle.center, circle.radius) for circle in circles] == [((0.0, 0.5), 0.1), ((0.0, 0.5), 0.25)]
     assert bool(((marks(obstacle) - torch.tensor([0.0, 0.5])).norm(dim=1) < 0.25).all())
     assert len(marks(obstacle)) == int((guided[: workspace.SHOWN] < 0.25).sum())
+
+
+def test_the_page_shows_the_demonstrations_of_its_split_and_says_which(
+    data: DemonstrationData, evaluation: Evaluation
+) -> None:
+    for split, name in config.SPLITS.items():
+        figure = figures.page(model(), data, evaluation, split)
+        assert figure.get_suptitle() == f"cgp, seed 0, preset smoke, {name} split"
+        assert figure.axes[0].get_title().startswith(f"{name} demonstrations\n")
+        shown = data.held_out[split].x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
+        assert torch.equal(sort(lines(figure.axes[0])), sort(shown))
 
 
 def test_the_frames_of_the_flow_are_its_states(evaluation: Evaluation) -> None:
@@ -147,7 +159,7 @@ def test_what_counts_as_touching_is_drawn_where_samples_are_judged(
     flow, shown = model("sample.radius=0.2"), evaluation.samples["none"][: workspace.SHOWN]
     nearest = distance(shown).amin(dim=1)
     assert bool(((nearest > 0.2) & (nearest < 0.3)).any())
-    for axis in (workspace.distances(flow, evaluation).axes[0], figures.page(flow, data, evaluation).axes[5]):
+    for axis in (workspace.distances(flow, evaluation).axes[0], figures.page(flow, data, evaluation, "test").axes[5]):
         drawn = [line for line in axis.lines if line.get_linestyle() == "-"]
         found = torch.tensor(np.array([line.get_ydata() for line in drawn]))
         torch.testing.assert_close(sort(found), sort(distance(shown)), rtol=0, atol=1e-6)  # float32
@@ -291,7 +303,7 @@ def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
     folder.mkdir(parents=True)
     (folder / "mine.txt").write_text("kept")
     (folder / "flow.png").write_text("of an earlier call")
-    gallery.draw(["cgp-s77"], Console(quiet=True))
+    gallery.draw(["cgp-s77"], "val", Console(quiet=True))
     written = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert written.pop("mine.txt") == b"kept"
     pictures = {"demonstrations", "sources", "page", "flow", "distances", "guidance", "solver_steps", "guidance_weight"}
@@ -304,6 +316,33 @@ def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
     assert logged == {name: written[name] for name in written.keys() - of_training}
 
 
+def test_the_pictures_of_the_test_split_take_no_place_of_the_others(
+    finished: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their samples are of that split's starts and goals, and their folders and artifacts are apart."""
+    asked: list[Tensor] = []
+    sample = gallery.sample
+    monkeypatch.setattr(workspace, "DPI", 20)
+
+    def watched(flow: ConFlow, x_1: Tensor) -> Evaluation:
+        asked.append(x_1)
+        return sample(flow, x_1)
+
+    monkeypatch.setattr(gallery, "sample", watched)
+    data = demonstrations(finished, config.load(["preset=smoke", "seed=77"]))
+    mine = Path("runs/figures/smoke_cgp-s77/flow.png")
+    mine.parent.mkdir(parents=True, exist_ok=True)
+    mine.write_text("of the validation split")
+    gallery.draw([finished.info.run_id, finished.info.run_id], "test", Console(quiet=True))
+    assert all(torch.equal(x_1, cycle(data.test.x, 512)) for x_1 in asked)
+    assert mine.read_text() == "of the validation split"
+    drawn = {file.name for file in (mine.parent / "test").iterdir()}
+    assert {file.name for file in tracking.artifact(finished, "figures/test").iterdir()} == drawn
+    assert {"page.png", "animation.html"} <= drawn
+    assert Path("runs/figures/test/methods.png").exists()
+    assert "test split" in (mine.parent / "test" / "animation.html").read_text()
+
+
 def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
     finished: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,7 +350,7 @@ def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: saved.append(path))
     monkeypatch.setattr(gallery, "_log", lambda *_: None)
     tracking.client().update_run(finished.info.run_id, name="../../elsewhere")
-    gallery.draw([finished.info.run_id, "latest"], Console(quiet=True))
+    gallery.draw([finished.info.run_id, "latest"], "val", Console(quiet=True))
     assert {path.parent for path in saved} == {Path("runs/figures/smoke_.._.._elsewhere"), Path("runs/figures")}
     assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png", "taken_back.png"]
 
@@ -328,10 +367,10 @@ def test_runs_of_one_name_are_told_apart_by_preset_and_by_what_was_changed(finis
 
 
 def test_a_second_call_draws_the_same_samples(data: DemonstrationData, evaluation: Evaluation) -> None:
-    again = gallery.sample(model("sample.robot_weight=2"), data)
+    again = gallery.sample(model("sample.robot_weight=2"), cycle(data.test.x, 512))
     assert torch.equal(again.source_samples, evaluation.source_samples)
     assert all(torch.equal(again.samples[setting], evaluation.samples[setting]) for setting in SETTINGS)
-    other = gallery.sample(model("sample.robot_weight=2", "seed=1"), data)
+    other = gallery.sample(model("sample.robot_weight=2", "seed=1"), cycle(data.test.x, 512))
     assert not torch.equal(other.source_samples, evaluation.source_samples)
 
 

@@ -38,7 +38,8 @@ def test_a_cells_progress_is_read_from_what_it_prints() -> None:
     cell = Cell([], config.load())
     for line, share in {
         "training 100/400  loss 0.1  9 s left": 0.225,
-        "sampling 2/3  setting robot": 0.9 + 0.2 / 3,
+        "sampling test 2/3  setting robot": 0.9 + 0.1 / 3,
+        "sampling validation 3/3  setting obstacle": 1.0,
     }.items():
         _listen(cell, line)
         assert cell.share == pytest.approx(share)

@@ -94,7 +94,7 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
     train = 'make ablations ABLATIONS=cgp SEEDS="0 1" PRESET=quick'
     assert found.commands["default"] == train
     assert found.commands["ConFlow (D+ and D-), sample.solver:rk4"] == (
-        f"{train} && for s in 0 1; do make evaluate RUN=quick/cgp-s$s ARGS='sample.solver=rk4'; done"
+        f"{train} && for s in 0 1; do make evaluate RUN=quick/cgp-s$s SPLIT=test ARGS='sample.solver=rk4'; done"
     )
     (other,) = (command for command in found.commands.values() if "amplitudes" in command)
     assert other == f"{train} ARGS='data.amplitudes=[0.9,0.15] data.jitter=0.05'"
@@ -136,7 +136,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
         report.render([long, quick, paper], "markdown", console)
     text = captured.get()
     low, high = wilson(300, 1000)
-    overview = text[text.index("**Robot collisions without guidance, at each preset**") :].splitlines()
+    overview = text[text.index("**Robot collisions without guidance, at each preset, test split**") :].splitlines()
     assert overview[2] == "|  | paper | long | quick |"
     assert overview[4].startswith("| ConFlow (D+ and D-) | 0.016 | 0.0160, within this network [")
     beside = f"0.3000, within this network [{low:.4f}, {high:.4f}]<br>300 of 1000, 1 seed"
@@ -148,7 +148,8 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     assert [each["preset"] for each in tree["cells"]] == [c.preset for one in (long, quick, paper) for c in one.cells]
     assert tree["presets"]["quick"]["claims"][0]["verdict"] == "too few seeds"
     titles = [line.strip("*") for line in text.splitlines() if line.startswith("**Table")]
-    assert [title[6] + title.rsplit(" ", 1)[1] for title in titles] == [
+    assert all(title.endswith(", test split") for title in titles)
+    assert [title[6] + title.removesuffix(", test split").rsplit(" ", 1)[1] for title in titles] == [
         *("1long", "2long", "3long", "4long", "1quick", "2quick", "3quick", "4quick", "4paper")
     ]
 
@@ -243,10 +244,50 @@ def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
     for key, value in flatten(settings.tree()).items():
         store.log_param(run_id, key, str(value))
     store.log_metric(run_id, "test/none/num", 10)
+    store.log_metric(run_id, "validation/none/num", 10)
+    store.log_metric(run_id, "test/obstacle/success_rate", 0.5)
+    store.log_metric(run_id, "val/none/robot_collision_rate", 0.2)
     store.log_metric(run_id, "train/loss", 0.1)
     store.set_terminated(run_id, "FINISHED")
     (path,) = record.publish("smoke")
     made = Record.read(path)
-    assert (made.run_id, made.metrics) == (run_id, {"test/none/num": 10})
+    expected = {"test/none/num": 10, "validation/none/num": 10, "test/obstacle/success_rate": 0.5}
+    assert (made.run_id, made.metrics) == (run_id, expected)
     assert made.origin == {**code.tags(), "git_sha": "abc"}
     assert made.changes == []
+
+
+def test_what_a_run_from_before_called_success_is_not_mixed_with_what_it_is_now(folder: Path) -> None:
+    """Before runs were measured on the validation split, success ignored the obstacle."""
+    store = tracking.client()
+    experiment = store.get_experiment_by_name("conflow")
+    assert experiment is not None
+    tags = {"ablation": "cgp", "preset": "smoke", "seed": "0", "config_sha": load(["preset=smoke"]).sha()}
+    for validated in (False, True):
+        run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
+        store.log_metric(run_id, "test/none/success_low", 0.5)
+        if validated:
+            store.log_metric(run_id, "validation/none/num", 10)
+        store.set_terminated(run_id, "FINISHED")
+        metrics = Record.of(store.get_run(run_id)).metrics
+        assert ("test/none/success_low" in metrics) == validated
+        assert metrics.get("test/none/success_at_waypoints_low") == (None if validated else 0.5)
+
+
+def test_the_results_of_a_split_are_found_where_the_tables_look_for_them() -> None:
+    metrics = {
+        "test/none/num": 1.0,
+        "evaluate/seed:8/none/num": 2.0,
+        "without_model/data/num": 3.0,
+        "validation/none/num": 4.0,
+        "evaluate/val seed:8/none/num": 5.0,
+        "evaluate/val same settings/none/num": 6.0,
+    }
+    made = replace(published("cgp", 0, 1), metrics=metrics)
+    assert made.on("test").metrics == dict(list(metrics.items())[:3])
+    assert made.on("val").metrics == {
+        "without_model/data/num": 3.0,
+        "test/none/num": 4.0,
+        "evaluate/seed:8/none/num": 5.0,
+        "evaluate/same settings/none/num": 6.0,
+    }

@@ -69,13 +69,19 @@ def test_a_run_holds_the_documented_metrics(trained: tuple[Run, str]) -> None:
         for metric in (*values, "path_length_median"):
             expected |= {f"test/{setting}/{metric}{part}" for part in ("", "_low", "_high")}
         expected |= {f"test/{setting}/{name}" for name in ("latency_ms", "num", "start_drift", "end_drift")}
+    expected |= {key.replace("test/", "validation/") for key in expected}
     expected |= {f"without_model/{what}/robot_collision_count" for what in ("data", "feasible", "source")}
     assert expected <= set(run.data.metrics)
 
 
 def test_metrics_are_logged_by_step(trained: tuple[Run, str], workplace: Path) -> None:
     run, _ = trained
-    for key, steps in {"train/loss": [10, 20, 30, 40], "val/loss": [20, 40], "test/none/num": [0]}.items():
+    for key, steps in {
+        "train/loss": [10, 20, 30, 40],
+        "val/loss": [20, 40],
+        "test/none/num": [0],
+        "validation/none/num": [0],
+    }.items():
         assert [metric.step for metric in store(workplace).get_metric_history(run.info.run_id, key)] == steps
 
 
@@ -94,28 +100,33 @@ def test_the_pictures_are_there(trained: tuple[Run, str]) -> None:
 
 def test_the_command_closes_with_the_metrics_and_the_way_to_the_pages(trained: tuple[Run, str]) -> None:
     run, output = trained
-    assert f"{run.data.metrics['test/none/robot_collision_rate']:.4f}" in output
+    assert f"{run.data.metrics['validation/none/energy_distance']:.4f}" in output
+    assert "cgp-s3, preset smoke, validation split" in output
     assert "make ui" in output.splitlines()[-1]
 
 
-def test_a_reloaded_model_samples_what_the_run_was_measured_on(trained: tuple[Run, str]) -> None:
+@pytest.mark.parametrize(("split", "group"), [("test", "test"), ("val", "validation")])
+def test_a_reloaded_model_samples_what_the_run_was_measured_on(
+    split: config.SplitName, group: str, trained: tuple[Run, str]
+) -> None:
     run, _ = trained
     model = load_model(artifacts(run) / "model.ckpt")
-    test = DemonstrationData(model.config).test.x
-    x_1, reference = test[torch.arange(64) % 50], test[~model.robots.violation(test)]
+    held_out = DemonstrationData(model.config).held_out[split].x
+    x_1, reference = held_out[torch.arange(64) % 50], held_out[~model.robots.violation(held_out)]
     for setting in SETTINGS:
-        x = model.sample(x_1, setting, random_stream("test samples", 3))
+        x = model.sample(x_1, setting, random_stream(f"{split} samples", 3))
         metrics = trajectory_metrics(model.robots, model.obstacle, reference, model.required(setting))
         metrics.update(x=x, x_1=x_1)
         for key, value in metrics.compute().items():
             # To the bit but for the order of sums: training and test may run on other numbers of threads.
-            assert run.data.metrics[f"test/{setting}/{key}"] == pytest.approx(value, rel=1e-5)
+            assert run.data.metrics[f"{group}/{setting}/{key}"] == pytest.approx(value, rel=1e-5)
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("ablation=cpg",), "did you mean cgp?"),
+        (("split=train",), "split=train: expected val or test"),
         (("train.max_stepz=3",), "did you mean train.max_steps?"),
         (("train.lr=-1",), "train.lr=-1.0: expected a finite number above 0"),
         (("preset=smoke", "data.path=missing.npz"), "data.path=missing.npz: no such file"),
@@ -132,19 +143,24 @@ def test_a_bad_command_ends_in_one_line_before_anything_is_tracked(
     assert len(runs(workplace)) == before
 
 
+@pytest.mark.parametrize(
+    ("options", "split", "mark"), [(["split=test"], "test", ""), (["split=val"], "val", "val "), ([], "val", "val ")]
+)
 def test_evaluating_again_adds_to_the_run_and_changes_nothing_that_it_had(
-    conflow: Command, workplace: Path, trained: tuple[Run, str]
+    options: list[str], split: config.SplitName, mark: str, conflow: Command, workplace: Path, trained: tuple[Run, str]
 ) -> None:
     before, _ = trained
-    result = conflow("evaluate", f"run={before.info.run_id}", "sample.steps=3", "sample.solver=midpoint", "seed=8")
+    settings = ["sample.steps=3", "sample.solver=midpoint", "seed=8"]
+    result = conflow("evaluate", f"run={before.info.run_id}", *settings, *options)
     assert result.returncode == 0, result.stderr
+    assert f"seed:8, {config.SPLITS[split]} split" in " ".join(result.stdout.split())
     after = store(workplace).get_run(before.info.run_id)
     assert after.info.status == "FINISHED"
     assert before.data.metrics.items() <= after.data.metrics.items()
-    prefix = "evaluate/sample.solver:midpoint sample.steps:3 seed:8"
-    model = load_model(artifacts(before) / "model.ckpt", ["sample.steps=3", "sample.solver=midpoint", "seed=8"])
-    x_1 = DemonstrationData(model.config).test.x[torch.arange(64) % 50]
-    x = model.sample(x_1, "robot", random_stream("test samples", 8))
+    prefix = f"evaluate/{mark}sample.solver:midpoint sample.steps:3 seed:8"
+    model = load_model(artifacts(before) / "model.ckpt", settings)
+    x_1 = DemonstrationData(model.config).held_out[split].x[torch.arange(64) % 50]
+    x = model.sample(x_1, "robot", random_stream(f"{split} samples", 8))
     counted = after.data.metrics[f"{prefix}/robot/robot_collision_count"]
     assert counted == model.robots.violation(x).sum()
     assert (artifacts(before) / f"{prefix}.yaml").exists()

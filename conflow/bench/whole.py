@@ -27,8 +27,8 @@ SECTIONS: dict[str, list[tuple[Any, str]]] = {
     "pictures": [(figures, name) for name in ("page", "demonstrations", "sources", "save")],
     "checkpoints": [(Checkpoints, "_save")],
     "validation": [(ConFlow, "validation_step"), (ValidationSamples, "on_validation_end")],
-    "test sampling": [(ConFlow, "flow")],
-    "test latencies": [(evaluation, "_latency_ms")],
+    "sampling": [(ConFlow, "flow")],
+    "latencies": [(evaluation, "_latency_ms")],
 }
 """What each of them consists of; of one that is called within another, the outer one has the time."""
 BOTH, LITTLE = "metrics and logging", Target(0.02)

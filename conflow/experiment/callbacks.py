@@ -95,7 +95,10 @@ class TrainingProgress(Callback):
 
 
 class ValidationSamples(Callback):
-    """Takes a small sample at every validation: val/none/robot_collision_rate beside val/loss."""
+    """Takes a small sample at every validation: the curve val/none/robot_collision_rate beside val/loss.
+
+    Of the trained model there is more under validation/: every setting and metric, and as many samples as of test.
+    """
 
     def __init__(self, data: DemonstrationData) -> None:
         self.data = data

@@ -65,7 +65,8 @@ def _compared(
         return _undecided(text, "no runs", f"no finished run of {missing}"), None, False
     a, b = (cell("", "", "", None, metric, runs[name]) for name in (lower, higher))
     if a is None or b is None:
-        return _undecided(text, "no runs", f"not all runs of {lower} and {higher} have {metric}"), None, False
+        reason = f"not all runs of {lower} and {higher} have {metric.removeprefix('test/')}"
+        return _undecided(text, "no runs", reason), None, False
     between = seeds.difference(scores(metric, runs[lower]), scores(metric, runs[higher]))
     detail = f"{digits(a.value)} against {digits(b.value)}, {a.seeds} and {b.seeds} seeds"
     if between is not None and between.pairs:

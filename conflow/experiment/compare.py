@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from conflow.experiment import code, config, paper, record
 from conflow.experiment.cells import BASELINE, COLLISIONS, METHODS, Cell, labels, tables
 from conflow.experiment.claims import Claim, claims
-from conflow.experiment.config import ConfigError
+from conflow.experiment.config import SPLITS, ConfigError, SplitName
 from conflow.experiment.record import Record
 
 
@@ -19,6 +19,8 @@ class Comparison:
         reading: how the paper was read, in settings; rows that were read otherwise say so.
         reasons: why rows differ from the paper's, for those that do.
         code: which runs are of other code than the present or, of published ones, than the others of their row.
+        split: whose starts and goals the models were given; rows without a model are always of the test split.
+        left_out: the names of finished runs that were not measured on it.
     """
 
     preset: str
@@ -29,38 +31,48 @@ class Comparison:
     reading: str
     reasons: dict[str, str]
     code: str
+    split: SplitName
+    left_out: list[str]
 
 
-def collect(preset: str, arguments: Sequence[str] = ()) -> Comparison:
+def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val") -> Comparison:
     """Compare the newest finished run of every ablation and seed at a preset, with arguments as they were trained.
 
     Where runs of the present code have finished, the newest of these.
 
     Raises:
-        ConfigError: there is no such run.
+        ConfigError: there is no such run, or none was measured on this split.
     """
     records = record.from_store(preset, arguments)
     if not records:
         raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
-    rows = _grouped(records, lambda one: one.ablation)
-    return _comparison(preset, rows, {}, _of_other_code(one for of_row in rows.values() for one in of_row))
+    measured = [one.on(split) for one in records if one.measured(split)]
+    if not measured:
+        raise ConfigError(
+            f"preset={preset}: no finished run was measured on the {SPLITS[split]} split, as those from before it was "
+            f"part of a run were not; try: split=test"
+        )
+    left_out = [f"{one.ablation}-s{one.seed}" for one in records if not one.measured(split)]
+    rows = _grouped(measured, lambda one: one.ablation)
+    of_code = _of_other_code(one for of_row in rows.values() for one in of_row)
+    return _comparison(preset, rows, {}, of_code, split, left_out)
 
 
 def collect_reference() -> list[Comparison]:
-    """Compare the records under runs/reference/, preset by preset from the one of the most training down.
+    """Compare the records under runs/reference/ on test, preset by preset from the one of the most training down.
 
     A preset that has changed runs alone, with nothing to compare them with, comes last.
 
     Raises:
         ConfigError: there are none.
     """
-    records = record.from_files()
+    records = [one.on("test") for one in record.from_files()]
     found = []
     for preset in sorted({one.preset for one in records}, key=_scale, reverse=True):
         plain = [one for one in records if one.preset == preset and not one.changes]
         changed = [one for one in records if one.preset == preset and one.changes]
         runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
-        found.append(_comparison(preset, runs, readings, _of_different_code(runs | readings)))
+        found.append(_comparison(preset, runs, readings, _of_different_code(runs | readings), "test", []))
     return sorted(found, key=lambda one: not one.claims)
 
 
@@ -108,7 +120,12 @@ def _of_different_code(rows: Mapping[str, list[Record]]) -> str:
 
 
 def _comparison(
-    preset: str, runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]], of_code: str
+    preset: str,
+    runs: Mapping[str, list[Record]],
+    readings: Mapping[str, list[Record]],
+    of_code: str,
+    split: SplitName,
+    left_out: list[str],
 ) -> Comparison:
     cells = tables(runs, readings)
     rows = dict(runs) | dict(readings)
@@ -118,10 +135,12 @@ def _comparison(
         cells,
         claims(runs),
         {name: [one.run_id for one in of_row] for name, of_row in rows.items()},
-        _commands(runs, readings),
+        _commands(runs, readings, split),
         " ".join(f"{key}={settings[key]}" for key in paper.OPEN if key in settings),
         _reasons(cells),
         of_code,
+        split,
+        left_out,
     )
 
 
@@ -138,7 +157,9 @@ def _reasons(cells: Iterable[Cell]) -> dict[str, str]:
     return found
 
 
-def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> dict[str, str]:
+def _commands(
+    runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]], split: SplitName
+) -> dict[str, str]:
     """What makes each row again, by the row's name."""
     found = {name: _command(of_row) for name, of_row in readings.items()}
     for ablation, of_row in runs.items():
@@ -147,7 +168,8 @@ def _commands(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Reco
         seeds = " ".join(str(one.seed) for one in of_row)
         for label in labels(of_row):
             arguments = "" if label == record.UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
-            evaluated = f"for s in {seeds}; do make evaluate RUN={of_row[0].preset}/{ablation}-s$s{arguments}; done"
+            run = f"{of_row[0].preset}/{ablation}-s$s"
+            evaluated = f"for s in {seeds}; do make evaluate RUN={run} SPLIT={split}{arguments}; done"
             found[f"{name}, {label}"] = f"{again} && {evaluated}"
     if "cgp" in runs:
         found["default"] = _command(runs["cgp"])

@@ -37,8 +37,11 @@ Mask = Literal["violates", "feasible"]
 PathKind = Literal["linear", "guided"]
 Norm = Literal["waypoints", "modes"]
 Accelerator = Literal["auto", "cpu", "gpu", "mps"]
+SplitName = Literal["val", "test"]
 Tree = dict[str, Any]
 
+SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
+"""The splits that are held out, and what each is called in titles and in the names of metrics."""
 
 SIZES = (
     "data.num",
@@ -374,6 +377,18 @@ def whole(options: Mapping[str, str], key: str, low: int, high: int) -> int:
     if not text.isdecimal() or len(text) > 99 or not low <= int(text) <= high:
         raise ConfigError(f"{key}={brief(text)}: expected a whole number of at least {low} and at most {high}")
     return int(text)
+
+
+def held_out(options: Mapping[str, str]) -> SplitName:
+    """The option `split`.
+
+    Raises:
+        ConfigError: it names none that is held out.
+    """
+    for name in SPLITS:
+        if options["split"] == name:
+            return name
+    raise ConfigError(f"split={brief(options['split'])}: expected {' or '.join(SPLITS)}")
 
 
 def split(argument: str) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
 from conflow.experiment.build import random_stream, repaired, robot_avoidance
-from conflow.experiment.config import Config, check_memory
+from conflow.experiment.config import Config, SplitName, check_memory
 from conflow.scene import trajectories
 from conflow.scene.trajectories import DemonstrationError
 
@@ -77,6 +77,8 @@ class DemonstrationData(LightningDataModule):
     `train` keeps no trajectory of `val` or `test`.
 
     Attributes:
+        held_out: what models are measured on, D+ and D- as they were demonstrated: `test`, and all of the validation
+            split, of which `val` is what val/loss is taken on.
         x, violates: all demonstrations and their labels M.
         digest: fingerprint of x, and of the labels that came with it; others follow from x and the config.
 
@@ -96,6 +98,7 @@ class DemonstrationData(LightningDataModule):
         check_memory("sample.num", config.sample.num, 8 * 4 * config.sample.num * self.T * self.D)
         self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
         self.digest = trajectories.digest(x, violates)
+        self.held_out: dict[SplitName, Split] = {}
         self.train, self.val, self.test = self._split(name)
 
     def _demonstrations(self) -> tuple[str, trajectories.Demonstrations]:
@@ -113,6 +116,7 @@ class DemonstrationData(LightningDataModule):
         val, test = round(data.val_fraction * len(order)), round(data.test_fraction * len(order))
         parts = torch.split(order, [len(order) - val - test, val, test])
         train_split, val_split, test_split = (Split(self.x[i], self.violates[i]) for i in parts)
+        self.held_out |= {"val": val_split, "test": test_split}
         if len(train_split.x) and bool(train_split.violates.all()):
             raise DemonstrationError(
                 f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, expected D+ too"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from conflow.experiment.build import random_stream
+from conflow.experiment.config import SPLITS, SplitName
 from conflow.experiment.datamodule import Split
 from conflow.experiment.metrics import EnergyDistance, endpoint_error, trajectory_metrics
 from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
@@ -27,8 +28,8 @@ class Evaluation:
         source_samples: x_0 of the source, (num, T, D), the same for every setting.
         samples: the trajectories of each setting, (num, T, D).
         results: the metrics of each setting.
-        baseline: the same metrics of what no model touched: "data", the demonstrations themselves, "feasible", D+ of
-            them alone, and "source".
+        baseline: of the test split, the same metrics of what no model touched: "data", the demonstrations themselves,
+            "feasible", D+ of them alone, and "source".
     """
 
     source_samples: Tensor
@@ -45,28 +46,38 @@ class Evaluation:
 
 
 @torch.no_grad()
-def evaluate(model: ConFlow, split: Split, display: ProgressDisplay) -> Evaluation:
+def evaluate(
+    model: ConFlow, split: Split, display: ProgressDisplay, name: SplitName = "test", timed: Evaluation | None = None
+) -> Evaluation:
     """Sample `sample.num` trajectories under every setting and measure them.
 
     Each gets the start and goal of a demonstration of the split, the first again after the last. All settings start
     from the same x_0, which depends on the seed alone, so they differ by their guidance only. D+ of the split, by its
     labels, is what the energy distance is taken to.
+
+    Args:
+        model: what to sample.
+        split: the demonstrations.
+        display: for progress.
+        name: the split's. Each has noise of its own, and what no model touched is measured on the test split alone.
+        timed: an evaluation of the same model, whose latencies hold here too; without it they are measured.
     """
-    task = display.add("sampling", len(SETTINGS))
+    task = display.add(f"sampling {SPLITS[name]}", len(SETTINGS))
     demonstrations, violates = split.x.to(model.device), split.violates.to(model.device)
     feasible = demonstrations[~violates]
     reference = feasible if len(feasible) > 1 else None  # one has no distance to another
     x_1 = cycle(demonstrations, model.config.sample.num)
     y = model.source.observe(x_1)
-    x_0 = model.source.sample(y, random_stream("test samples", model.config.seed, device=model.device))
+    x_0 = model.source.sample(y, random_stream(f"{name} samples", model.config.seed, device=model.device))
     evaluation = Evaluation(x_0.cpu())
-    # These two hold the reference itself, so their energy distance to it is not a distance of independent samples.
-    evaluation.baseline["data"] = measure(model, demonstrations, demonstrations, None)
-    if reference is not None:
-        evaluation.baseline["feasible"] = measure(model, feasible, feasible, None)
-        if int(violates.sum()) > 1:
-            evaluation.baseline["data"] |= _mixture_distance(demonstrations[violates], feasible)
-    evaluation.baseline["source"] = measure(model, x_0, x_1, reference)
+    if name == "test":
+        # These two hold the reference itself, so their energy distance to it is not one of independent samples.
+        evaluation.baseline["data"] = measure(model, demonstrations, demonstrations, None)
+        if reference is not None:
+            evaluation.baseline["feasible"] = measure(model, feasible, feasible, None)
+            if int(violates.sum()) > 1:
+                evaluation.baseline["data"] |= _mixture_distance(demonstrations[violates], feasible)
+        evaluation.baseline["source"] = measure(model, x_0, x_1, reference)
     for done, setting in enumerate(SETTINGS, start=1):
         x = model.flow(x_0, setting, start_and_goal(x_1))
         evaluation.samples[setting] = x.cpu()
@@ -74,8 +85,8 @@ def evaluate(model: ConFlow, split: Split, display: ProgressDisplay) -> Evaluati
             f"{name}_drift": float(endpoint_error(x.cpu(), evaluation.samples["none"], waypoint).mean())
             for name, waypoint in {"start": 0, "end": -1}.items()
         }
-        latency = {"latency_ms": _latency_ms(model, x_1, setting)}
-        evaluation.results[setting] = measure(model, x, x_1, reference, setting) | drift | latency
+        latency = timed.results[setting]["latency_ms"] if timed else _latency_ms(model, x_1, setting)
+        evaluation.results[setting] = measure(model, x, x_1, reference, setting) | drift | {"latency_ms": latency}
         display.update(task, done, f"setting {setting}")
     return evaluation
 

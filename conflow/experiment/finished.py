@@ -8,7 +8,7 @@ from rich.console import Console
 
 from conflow.experiment import checkpoints, code, record, report, tracking
 from conflow.experiment import config as configuration
-from conflow.experiment.config import Config
+from conflow.experiment.config import SPLITS, Config, SplitName
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import evaluate
 from conflow.experiment.module import ConFlow
@@ -63,11 +63,11 @@ def check_data(run: Run, data: DemonstrationData) -> None:
         )
 
 
-def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> None:
-    """Sample a finished run anew with other settings, and add the results to it.
+def evaluate_again(wanted: str, arguments: Sequence[str], split: SplitName, console: Console) -> None:
+    """Sample a finished run anew with other settings, for starts and goals of a split, and add the results to it.
 
-    Metrics go under `evaluate/<settings>/SETTING/...`, where no metric of training stands, and the settings beside
-    them into the artifact `evaluate/<settings>.yaml`.
+    Metrics go under `evaluate/<settings>/SETTING/...`, where no metric of training stands, those of the validation
+    split under `evaluate/val <settings>/SETTING/...`, and the settings beside them into an artifact of that name.
     """
     run = tracking.find_run(wanted)
     model = load_model(tracking.artifact(run, MODEL_FILE), arguments)
@@ -76,12 +76,14 @@ def evaluate_again(wanted: str, arguments: Sequence[str], console: Console) -> N
         console.print(said, highlight=False, soft_wrap=True)
     # MLflow allows no = in a metric's name.
     label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or record.UNCHANGED
+    group = ("evaluate/" if split == "test" else record.EVALUATED_ON_VALIDATION) + label
     data = demonstrations(run, model.config)
     with ProgressDisplay(console) as display:
-        evaluation = evaluate(model, data.test, display)
+        evaluation = evaluate(model, data.held_out[split], display, split)
     logger = tracking.RunLogger(tracking.client(), run.info.run_id)
     with tracking.whole():
-        logger.store.log_dict(run.info.run_id, model.config.tree(), f"evaluate/{label}.yaml")
-        logger.log_metrics(evaluation.keyed(f"evaluate/{label}/", baseline=False), 0)
+        logger.store.log_dict(run.info.run_id, model.config.tree(), f"{group}.yaml")
+        logger.log_metrics(evaluation.keyed(f"{group}/", baseline=False), 0)
         logger.save()
-    console.print(report.results_table(evaluation.results, f"{run.info.run_name}, {label}"))
+    title = f"{run.info.run_name}, {label}, {SPLITS[split]} split"
+    console.print(report.results_table(evaluation.results, title))

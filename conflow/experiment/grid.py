@@ -20,7 +20,9 @@ from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.progress import ProgressDisplay
 from conflow.scene.trajectories import DemonstrationError
 
-STEPS = re.compile(r"^(training|sampling) (\d+)/(\d+)")
+STEPS = re.compile(r"^(training|sampling test|sampling validation) (\d+)/(\d+)")
+STAGES = {"training": (0.0, 0.9), "sampling test": (0.9, 0.05), "sampling validation": (0.95, 0.05)}
+"""What comes before each stage of a cell, and what it adds, as shares of the whole."""
 
 
 @dataclass
@@ -171,10 +173,10 @@ def _work(waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[st
 
 
 def _listen(cell: Cell, line: str) -> None:
-    """Take a cell's progress from a line that it printed. Sampling counts as the last tenth."""
+    """Take a cell's progress from a line that it printed."""
     if line:
         cell.output.append(line)
     if found := STEPS.match(line):
-        done = int(found[2]) / int(found[3])
-        cell.share = 0.9 * done if found[1] == "training" else 0.9 + 0.1 * done
+        before, share = STAGES[found[1]]
+        cell.share = before + share * int(found[2]) / int(found[3])
         cell.note = f"{found[1]} {found[2]}/{found[3]}"

@@ -3,19 +3,24 @@
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 from mlflow.entities import Run
 
 from conflow.experiment import code, config, tracking
-from conflow.experiment.config import ConfigError, flatten
+from conflow.experiment.config import SPLITS, ConfigError, SplitName, flatten
 
 FOLDER = tracking.RUNS / "reference" / "runs"
-PUBLISHED = ("test/", "without_model/", "source/", "evaluate/")
+PUBLISHED = ("test/", "validation/", "without_model/", "source/", "evaluate/")
 UNCHANGED = "same settings"
 """The label of a run that was sampled again as it is."""
+EVALUATED_ON_VALIDATION = "evaluate/val "
+"""Begins the metrics of a run that was sampled again on the validation split; on test a label follows `evaluate/`."""
+VALIDATED = {"validation/": "test/", EVALUATED_ON_VALIDATION: "evaluate/"}
+"""How metrics of the validation split begin, and those of the test split that they correspond to."""
+SUCCESS = re.compile(r"/success_(rate|low|high|count)$")
 ORIGIN = ("code_sha", "code", "git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
 
 
@@ -45,6 +50,9 @@ class Record:
         """The record of a finished run."""
         tags = run.data.tags
         metrics = {key: value for key, value in sorted(run.data.metrics.items()) if key.startswith(PUBLISHED)}
+        if not any(key.startswith("validation/") for key in metrics):
+            # The same change made success what it is now; before, it ignored the obstacle and passed between waypoints.
+            metrics = {SUCCESS.sub(r"/success_at_waypoints_\1", key): value for key, value in metrics.items()}
         origin = {key: tags[key] for key in ORIGIN if key in tags}
         settings = dict(sorted(run.data.params.items()))
         where = (str(run.info.run_id), tags["ablation"], tags["preset"], int(tags["seed"]))
@@ -70,6 +78,22 @@ class Record:
         path = folder / f"{name}.json"
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
         return path
+
+    def measured(self, split: SplitName) -> bool:
+        """Whether the run was measured on a split; of one from before there is the test split alone."""
+        return any(key.startswith(f"{SPLITS[split]}/") for key in self.metrics)
+
+    def on(self, split: SplitName) -> "Record":
+        """The record with the results of one split alone, under the test split's names, which the tables read."""
+        metrics = {}
+        for key, value in self.metrics.items():
+            of_validation = next((prefix for prefix in VALIDATED if key.startswith(prefix)), None)
+            if of_validation is None:
+                if split == "test" or not key.startswith(tuple(VALIDATED.values())):
+                    metrics[key] = value
+            elif split == "val":
+                metrics[VALIDATED[of_validation] + key.removeprefix(of_validation)] = value
+        return replace(self, metrics=metrics)
 
     @cached_property
     def changes(self) -> list[str]:

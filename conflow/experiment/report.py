@@ -14,7 +14,7 @@ from rich.table import Table
 from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell, digits
 from conflow.experiment.claims import Claim
 from conflow.experiment.compare import Comparison
-from conflow.experiment.config import ConfigError
+from conflow.experiment.config import SPLITS, ConfigError
 from conflow.experiment.evaluation import Metrics
 from conflow.experiment.module import Setting
 
@@ -47,7 +47,7 @@ ROWS = {
 
 
 def results_table(results: dict[Setting, Metrics], title: str) -> Table:
-    """The test metrics of one run, a column for each setting, each with its 95 % interval."""
+    """The metrics of one run on a split, a column for each setting, each with its 95 % interval."""
     num = int(next(iter(results.values()))["num"])
     made = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
     made.add_column("metric")
@@ -97,12 +97,24 @@ def render(comparisons: Sequence[Comparison], form: Format, console: Console) ->
     else:
         for one in comparisons:
             _print_sheets(_sheets(one), form, console)
-            console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
-            if one.code:
-                console.out(f"{one.code}\n", highlight=False)
+            for line in _notes(one):
+                console.out(f"{line}\n", highlight=False)
         if len(comparisons) > 1:
             _print_sheets([_overview(comparisons)], form, console)
         console.out(NOTE, highlight=False)
+
+
+def _notes(comparison: Comparison) -> list[str]:
+    """What holds for all tables of a comparison."""
+    notes = [f"Unless a row says otherwise, at preset {comparison.preset}: {comparison.reading}"]
+    if comparison.split != "test" and any(cell.without_model for cell in comparison.cells):
+        notes.append("Rows without a model are of the test split.")
+    if comparison.code:
+        notes.append(comparison.code)
+    if comparison.left_out:
+        runs = ", ".join(comparison.left_out)
+        notes.append(f"Not measured on the {SPLITS[comparison.split]} split, and left out: {runs}; try: split=test")
+    return notes
 
 
 def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> None:
@@ -148,7 +160,8 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
         if any(of_row):
             paper = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")
             rows.append([method, paper, *(_rate(cell) if cell else "" for cell in of_row)])
-    return "Robot collisions without guidance, at each preset", ["", "paper", *presets], rows
+    title = f"Robot collisions without guidance, at each preset, {SPLITS[comparisons[0].split]} split"
+    return title, ["", "paper", *presets], rows
 
 
 def _rate(cell: Cell) -> str:
@@ -181,7 +194,8 @@ def _sheets(comparison: Comparison) -> list[Sheet]:
             [[row, reason] for row, reason in comparison.reasons.items()],
         ),
     ]
-    return [(f"{title}, preset {comparison.preset}", header, rows) for title, header, rows in sheets if rows]
+    where = f"preset {comparison.preset}, {SPLITS[comparison.split]} split"
+    return [(f"{title}, {where}", header, rows) for title, header, rows in sheets if rows]
 
 
 def _methods_down(comparison: Comparison, number: str, title: str, metrics: Mapping[str, str]) -> Sheet:

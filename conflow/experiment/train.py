@@ -14,7 +14,7 @@ from conflow.experiment import checkpoints, figures, report, resume, tracking
 from conflow.experiment.build import fitted
 from conflow.experiment.callbacks import TrainingLog, TrainingProgress, ValidationSamples
 from conflow.experiment.checkpoints import AtomicCheckpointIO, Checkpoints
-from conflow.experiment.config import Config
+from conflow.experiment.config import SPLITS, Config, SplitName
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import evaluate
 from conflow.experiment.finished import MODEL_FILE
@@ -22,14 +22,17 @@ from conflow.experiment.module import ConFlow, DivergedError
 from conflow.experiment.progress import ProgressDisplay
 
 
-def train(config: Config, console: Console, wanted: str = "", any_code: bool = False) -> str:
+def train(config: Config, console: Console, wanted: str = "", any_code: bool = False, split: SplitName = "val") -> str:
     """Train, sample, evaluate and log one experiment; the id of its run.
+
+    Both splits that are held out are measured and logged: methods are chosen by the one and reported by the other.
 
     Args:
         config: the experiment.
         console: for progress and results.
         wanted: an interrupted run of this experiment to go on with: its id, NAME, PRESET/NAME, or "latest".
         any_code: go on with it also where other code began it.
+        split: the one whose results are printed.
 
     Raises:
         DemonstrationError: before anything is tracked.
@@ -55,21 +58,23 @@ def train(config: Config, console: Console, wanted: str = "", any_code: bool = F
             except DivergedError as error:
                 raise DivergedError(f"{error}; {_last_good(run_id)}") from None
             # Lightning leaves the model on the CPU.
-            evaluation = evaluate(model.eval().to(loop.strategy.root_device), data.test, display)
+            model.eval().to(loop.strategy.root_device)
+            tested = evaluate(model, data.held_out["test"], display, "test")
+            validated = evaluate(model, data.held_out["val"], display, "val", timed=tested)
         # One value a run: at step 0 MLflow draws bars that compare runs, at any other a line of one point.
-        logger.log_metrics(evaluation.keyed(), 0)
+        logger.log_metrics(tested.keyed("test/") | validated.keyed("validation/"), 0)
         with tempfile.TemporaryDirectory() as folder:
             loop.save_checkpoint(Path(folder, MODEL_FILE), weights_only=True)
             model.cpu()  # as what was sampled
             pictures = {
-                "page": figures.page(model, data, evaluation),
+                "page": figures.page(model, data, validated, "val"),
                 "demonstrations": figures.demonstrations(data),
-                "sources": figures.sources(model, evaluation),
+                "sources": figures.sources(model, validated),
             }
             figures.save(pictures, Path(folder, "figures"))
             logger.log_files(folder)
-    title = f"{config.ablation}-s{config.seed}, preset {config.preset}"
-    console.print(report.results_table(evaluation.results, title))
+    title = f"{config.ablation}-s{config.seed}, preset {config.preset}, {SPLITS[split]} split"
+    console.print(report.results_table((validated if split == "val" else tested).results, title))
     return run_id
 
 

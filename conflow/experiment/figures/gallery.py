@@ -11,8 +11,7 @@ from torch import Tensor
 
 from conflow.experiment import compare, diagnostics, tracking
 from conflow.experiment.build import random_stream
-from conflow.experiment.config import ConfigError
-from conflow.experiment.datamodule import DemonstrationData
+from conflow.experiment.config import SPLITS, ConfigError, SplitName
 from conflow.experiment.evaluation import Evaluation, cycle
 from conflow.experiment.figures import curves, workspace
 from conflow.experiment.figures.animation import animation
@@ -30,14 +29,16 @@ LONGEST = 200
 """Characters of a folder's name; systems allow 255 bytes."""
 
 
-def draw(wanted: Sequence[str], console: Console) -> None:
-    """Draw the pictures of each run; of several runs also a comparison of what they generate.
+def draw(wanted: Sequence[str], split: SplitName, console: Console) -> None:
+    """Draw the pictures of each run, for starts and goals of a split; of several runs also a comparison of them.
+
+    Those of the test split are in a folder `test` of their own, so that neither takes the place of the other.
 
     Raises:
         ConfigError: there is no such run.
     """
     runs = [tracking.find_run(name) for name in wanted]
-    made = [(_title(run), *_draw_run(run, console)) for run in runs]
+    made = [(f"{_title(run)}, {SPLITS[split]} split", *_draw_run(run, split, console)) for run in runs]
     if len(made) > 1:
         console.print("all runs: methods.png, taken_back.png", highlight=False)
         methods = workspace.methods([(title, model, evaluation) for title, model, evaluation, _ in made])
@@ -45,7 +46,7 @@ def draw(wanted: Sequence[str], console: Console) -> None:
             [(_collisions(title, model, evaluation), shares) for title, model, evaluation, shares in made]
         )
         taken_back.axes[0].set_title(f"what the velocity takes back by t = 1, at t = {COMPARED}")
-        workspace.save({"methods": methods, "taken_back": taken_back}, _folder())
+        workspace.save({"methods": methods, "taken_back": taken_back}, _folder() / _subfolder(split))
 
 
 def draw_front(console: Console) -> None:
@@ -79,22 +80,26 @@ def _folder() -> Path:
     return tracking.RUNS / "figures"
 
 
-def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
+def _subfolder(split: SplitName) -> str:
+    return "" if split == "val" else split
+
+
+def _draw_run(run: Run, split: SplitName, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
     """Write and log a run's pictures; its model, the samples that they show, and `taken_back` at t = 0.6."""
     model = load_model(tracking.artifact(run, MODEL_FILE))
     data = demonstrations(run, model.config)
+    x_1 = cycle(data.held_out[split].x, NUM)
     name = str(run.info.run_name)
     # A name given in MLflow's pages may hold anything, also a way out of the folder.
-    folder = _folder() / re.sub(r"[^\w.=-]+", "_", _title(run))[:LONGEST]
-    console.print(f"{name}: {NUM} trajectories under each setting", highlight=False)
-    evaluation = sample(model, data)
-    x_0, x_1 = evaluation.source_samples, cycle(data.test.x, NUM)
-    ends = start_and_goal(x_1)
+    folder = _folder() / re.sub(r"[^\w.=-]+", "_", _title(run))[:LONGEST] / _subfolder(split)
+    console.print(f"{name}: {NUM} trajectories under each setting, {SPLITS[split]} split", highlight=False)
+    evaluation = sample(model, x_1)
+    x_0, ends = evaluation.source_samples, start_and_goal(x_1)
     shares = {t: diagnostics.taken_back(model, x_0, x_1, t) for t in TIMES}
     pictures: dict[str, Callable[[], Figure]] = {
         "demonstrations": lambda: workspace.demonstrations(data),
         "sources": lambda: workspace.sources(model, evaluation),
-        "page": lambda: workspace.page(model, data, evaluation),
+        "page": lambda: workspace.page(model, data, evaluation, split),
         "flow": lambda: workspace.flow(model, x_0, ends),
         "distances": lambda: workspace.distances(model, evaluation),
         "taken_back": lambda: curves.taken_back([(f"t = {t}", share) for t, share in shares.items()]),
@@ -107,21 +112,21 @@ def _draw_run(run: Run, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
         workspace.save({title: picture()}, folder)
     console.print(f"{name}: animation.html", highlight=False)
     page = folder / "animation.html"
-    page.write_text(animation(model, evaluation, f"ConFlow, run {name}"), encoding="utf-8")
-    # Training logged its own of these, of all its samples.
-    _log(run, [page, *(folder / f"{title}.png" for title in pictures if title not in workspace.OF_TRAINING)])
+    page.write_text(animation(model, evaluation, f"ConFlow, run {name}, {SPLITS[split]} split"), encoding="utf-8")
+    # Training logged its own of these, of all its samples of the validation split.
+    of_training = workspace.OF_TRAINING if split == "val" else ()
+    _log(run, [page, *(folder / f"{title}.png" for title in pictures if title not in of_training)], split)
     console.print(f"{name}: pictures are in {folder}", highlight=False)
     return model, evaluation, shares[COMPARED]
 
 
-def sample(model: ConFlow, data: DemonstrationData) -> Evaluation:
-    """Trajectories under every setting from the same x_0, with starts and goals of test demonstrations."""
-    x_1 = cycle(data.test.x, NUM)
+def sample(model: ConFlow, x_1: Tensor) -> Evaluation:
+    """Trajectories under every setting from the same x_0, with the starts and goals of x_1 (batch, T, D)."""
     x_0 = model.source.sample(model.source.observe(x_1), random_stream("figures", model.config.seed))
     return Evaluation(x_0, {setting: model.flow(x_0, setting, start_and_goal(x_1)) for setting in SETTINGS})
 
 
-def _log(run: Run, files: Sequence[Path]) -> None:
+def _log(run: Run, files: Sequence[Path], split: SplitName) -> None:
     store = tracking.client()
     for file in files:
-        store.log_artifact(run.info.run_id, str(file), "figures")
+        store.log_artifact(run.info.run_id, str(file), str(Path("figures", _subfolder(split))))

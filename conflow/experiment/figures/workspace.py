@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 from torch import Tensor
 
 from conflow.experiment.build import judged_radius, robot_avoidance
+from conflow.experiment.config import SPLITS, SplitName
 from conflow.experiment.datamodule import DemonstrationData
 from conflow.experiment.evaluation import Evaluation
 from conflow.experiment.module import SETTINGS, ConFlow
@@ -53,18 +54,18 @@ def sources(model: ConFlow, evaluation: Evaluation) -> Figure:
     return figure
 
 
-def page(model: ConFlow, data: DemonstrationData, evaluation: Evaluation) -> Figure:
-    """A run at a glance: what it learned from, what it starts from, and what it makes under the three settings."""
+def page(model: ConFlow, data: DemonstrationData, evaluation: Evaluation, split: SplitName) -> Figure:
+    """A run at a glance: demonstrations of a split, what it starts from, and what it makes under the three settings."""
     config = model.config
     figure, axes = _workspaces(2, 3)
-    _judged(axes[0], data.test.x, model.robots, "test demonstrations")
+    _judged(axes[0], data.held_out[split].x, model.robots, f"{SPLITS[split]} demonstrations")
     _judged(axes[1], evaluation.source_samples, model.robots, f"source: {config.source.kind}")
     _zoom_out(axes[1:2], evaluation.source_samples)
     _settings(axes[2:5], model, evaluation)
     _distances(axes[5], evaluation.samples["none"], model)
     axes[5].set_title("distance of the robots\nno guidance")
     _legend(figure, model.D // 2)
-    figure.suptitle(f"{config.ablation}, seed {config.seed}, preset {config.preset}")
+    figure.suptitle(f"{config.ablation}, seed {config.seed}, preset {config.preset}, {SPLITS[split]} split")
     return figure
 
 
