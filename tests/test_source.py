@@ -289,13 +289,13 @@ def test_constants_have_the_same_bits_for_every_number_of_threads() -> None:
 
 
 def test_a_second_thread_of_less_accuracy_changes_no_constant(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a busy machine, where half of an `exp` shared by two threads was off by 4.5e-10."""
+    """As on a busy machine, where half of a shared `exp` was off by 4.5e-10; here by what single precision shows."""
     expected = constants()
 
     def careless(accurate: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
         def function(x: Tensor) -> Tensor:
             error = torch.zeros(x.numel(), dtype=x.dtype)
-            error[x.numel() // 2 :] = 4.5e-10 * (torch.get_num_threads() > 1)
+            error[: x.numel() // 2] = 1e-5 * (torch.get_num_threads() > 1)
             return accurate(x) * (1 + error.view_as(x))
 
         return function
