@@ -94,8 +94,9 @@ class DemonstrationData(LightningDataModule):
         trajectories.check(x, name)
         self.x = x
         self.T, self.D = x.shape[1:]
-        # x_0, x_1, and what each of the three settings makes of them; the metrics join one, and double its precision.
-        check_memory("sample.num", config.sample.num, 8 * 4 * config.sample.num * self.T * self.D)
+        # x_1, and of either split x_0 and what each of the three settings makes of it; the metrics join one, and double
+        # its precision.
+        check_memory("sample.num", config.sample.num, 12 * 4 * config.sample.num * self.T * self.D)
         self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
         self.digest = trajectories.digest(x, violates)
         self.held_out: dict[SplitName, Split] = {}
