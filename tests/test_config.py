@@ -30,8 +30,12 @@ CHANGES = {
     },
     "few_steps": {"sample.solver", "sample.steps"},
 }
-CHANGES["plus"] = (CHANGES["end"] | CHANGES["spectral"] | CHANGES["fitted"] | CHANGES["few_steps"]) | {
+CHANGES["plus"] = (CHANGES["end"] | CHANGES["spectral"] | CHANGES["fitted"]) - {"source.modes"} | {
     "constraint.gamma",
+    "correction.ramp",
+    "correction.walls",
+    "train.norm",
+    "sample.steps",
     "train.max_steps",
     "sample.num",
     "sample.robot_weight",

@@ -279,8 +279,8 @@ def test_guidance_at_the_end_acts_where_its_training_does(t: float) -> None:
 
 def test_the_norm_of_the_modes_weighs_each_by_its_width() -> None:
     """A residual along one mode counts sigma_1 of the leading mode over its own; with equal widths both norms agree."""
-    flow = model("ablation=plus", "source.fit=false", "source.modes=null", "train.norm=modes")
-    plain = model("ablation=plus", "source.fit=false", "source.modes=null")
+    flow = model("ablation=plus", "source.fit=false")
+    plain = model("ablation=plus", "source.fit=false", "train.norm=waypoints")
     v = flow.v
     assert isinstance(v, SpectralMLP)
     u = torch.randn(3, *swap(1).shape[1:], generator=noise())
