@@ -13,6 +13,7 @@ from conflow.experiment.metrics import (
     Diversity,
     EndpointError,
     EnergyDistance,
+    NearRate,
     OutsideRate,
     PathLength,
     Smoothness,
@@ -336,3 +337,11 @@ def test_without_a_reference_there_is_no_energy_distance_and_all_else() -> None:
         each.update(x=x, x_1=x)
     left_out = with_one.compute().keys() - without.compute().keys()
     assert left_out == {"energy_distance", "energy_distance_low", "energy_distance_high"}
+
+
+def test_near_is_what_comes_nearer_than_the_berth_whether_it_collides_or_not() -> None:
+    """Robots 0.3 wide that keep 0.2, 0.39 and 0.41 between their centres: two of three are near."""
+    metric = NearRate("near", ROBOTS)
+    d = torch.tensor([0.2, 0.39, 0.41])[:, None].expand(3, 5)
+    metric.update(torch.stack([d, 0 * d, 0 * d, 0 * d], dim=2))
+    assert (metric.compute()["near_count"], metric.compute()["near_rate"]) == (2, pytest.approx(2 / 3))

@@ -16,6 +16,8 @@ from conflow.scene.constraint import Constraint
 
 Z = 1.959963984540054
 """The 97.5 % quantile of the standard normal: all intervals are 95 % intervals."""
+BERTH = 0.1
+"""Robots that come nearer to touching than this, in workspace units, count as near."""
 REACHED = 0.01
 """Starts and goals count as reached within this `endpoint_error`, in workspace units per robot."""
 PAIR_ROWS, PAIR_COLUMNS = 1000, 10_000
@@ -164,6 +166,21 @@ class SweptCollisionRate(CollisionRate):
 
     def update(self, x: Tensor) -> None:
         self.add(~keeps(self.constraint, x))
+
+
+class NearRate(_Rate):
+    """Fraction of trajectories whose smallest clearance is below `BERTH`, collisions included.
+
+    A low collision rate is cheap where everybody is kept far apart: beside that of the demonstrations it shows by how
+    much.
+    """
+
+    def __init__(self, name: str, constraint: Constraint) -> None:
+        super().__init__(name)
+        self.constraint = constraint
+
+    def update(self, x: Tensor) -> None:
+        self.add(self.constraint.clearance(x).amin(dim=1) < BERTH)
 
 
 class OutsideRate(_Rate):
@@ -328,6 +345,7 @@ def trajectory_metrics(
         "robot_collision": CollisionRate("robot_collision", robots),
         "object_collision": CollisionRate("object_collision", obstacle),
         "robot_collision_swept": SweptCollisionRate("robot_collision_swept", robots),
+        "near": NearRate("near", robots),
         "success": SuccessRate("success", kept),
         "outside": OutsideRate("outside"),
         "smoothness": Smoothness(),
