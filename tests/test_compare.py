@@ -326,21 +326,23 @@ def test_runs_of_the_present_code_come_before_newer_ones_and_others_are_named(
 
 
 def test_each_split_is_compared_for_itself_and_named_in_every_title(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.chdir(tmp_path)
     for seed in range(2):
-        add_run("cgp", seed, 20, 0.01)
+        add_run("cgp", seed, 300, 0.01)
         add_run("fm", seed, 40, 0.01)
-    for (split, name), count in zip(config.SPLITS.items(), (40, 42), strict=True):
+    for (split, name), count in zip(config.SPLITS.items(), (600, 602), strict=True):
         found = compare.collect("smoke", split=split)
         assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").count == count
         text = rendered(found, "markdown")
         titles = [line for line in text.splitlines() if line.startswith("**")]
-        assert len(titles) == 5
+        assert len(titles) == 5, "three tables, the claims and the reasons"
         assert all(title.endswith(f", {name} split**") for title in titles)
         assert ("Rows without a model are of the test split." in text) == (split == "val")
+        rendered(found, "csv")
+        assert f"preset smoke, {name} split" in capsys.readouterr().err.splitlines()
 
 
 def test_runs_that_were_not_measured_on_a_split_are_left_out_and_named(

@@ -15,7 +15,7 @@ DECISIVE = (
     "experiment/module.py",  # loss, optimiser and sampling
     "experiment/train.py",  # the loop, and what comes in which order
     "experiment/callbacks.py",  # what is measured during training
-    "experiment/evaluation.py",  # what is sampled for the test
+    "experiment/evaluation.py",  # what is sampled for validation and test
     "experiment/metrics.py",  # and how that is measured
 )
 """The files under conflow/ that train and measure.

@@ -91,30 +91,33 @@ def render(comparisons: Sequence[Comparison], form: Format, console: Console) ->
     elif form == "csv":
         cells = [cell for one in comparisons for cell in one.cells]
         console.out(csv_text(Cell, cells), end="", highlight=False)
-        for one in comparisons:
-            if one.code:  # beside the cells, of which it is none
-                print(one.code, file=sys.stderr)
+        for one in comparisons:  # beside the cells, of which this is none
+            for line in (_where(one), *_reservations(one)):
+                print(line, file=sys.stderr)
     else:
         for one in comparisons:
             _print_sheets(_sheets(one), form, console)
-            for line in _notes(one):
+            console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
+            for line in _reservations(one):
                 console.out(f"{line}\n", highlight=False)
         if len(comparisons) > 1:
             _print_sheets([_overview(comparisons)], form, console)
         console.out(NOTE, highlight=False)
 
 
-def _notes(comparison: Comparison) -> list[str]:
-    """What holds for all tables of a comparison."""
-    notes = [f"Unless a row says otherwise, at preset {comparison.preset}: {comparison.reading}"]
+def _where(comparison: Comparison) -> str:
+    return f"preset {comparison.preset}, {SPLITS[comparison.split]} split"
+
+
+def _reservations(comparison: Comparison) -> list[str]:
+    """Which runs are not what the others are, or were measured elsewhere."""
+    found = [comparison.code] if comparison.code else []
     if comparison.split != "test" and any(cell.without_model for cell in comparison.cells):
-        notes.append("Rows without a model are of the test split.")
-    if comparison.code:
-        notes.append(comparison.code)
+        found.append("Rows without a model are of the test split.")
     if comparison.left_out:
         runs = ", ".join(comparison.left_out)
-        notes.append(f"Not measured on the {SPLITS[comparison.split]} split, and left out: {runs}; try: split=test")
-    return notes
+        found.append(f"Not measured on the {SPLITS[comparison.split]} split, and left out: {runs}; try: split=test")
+    return found
 
 
 def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> None:
@@ -194,8 +197,7 @@ def _sheets(comparison: Comparison) -> list[Sheet]:
             [[row, reason] for row, reason in comparison.reasons.items()],
         ),
     ]
-    where = f"preset {comparison.preset}, {SPLITS[comparison.split]} split"
-    return [(f"{title}, {where}", header, rows) for title, header, rows in sheets if rows]
+    return [(f"{title}, {_where(comparison)}", header, rows) for title, header, rows in sheets if rows]
 
 
 def _methods_down(comparison: Comparison, number: str, title: str, metrics: Mapping[str, str]) -> Sheet:

@@ -135,7 +135,7 @@ TOO_LARGE = [
     (("data.num=100000000", "data.horizon=4096"), "data.num=100000000: takes 24415"),
     (("network.hidden=65536", "network.blocks=1024"), "network.blocks=1024, network.hidden=65536: takes 131"),
     (("train.batch_size=1000000000",), "train.batch_size=1000000000: takes "),
-    (("sample.num=1000000000",), "sample.num=1000000000: takes 3815"),
+    (("sample.num=1000000000",), "sample.num=1000000000: takes 5723"),
 ]
 
 
@@ -355,7 +355,7 @@ OPTIONS = [
     (("demonstrations", f"num={HUGE}"), f"...: {WHOLE}"),
     (("demonstrations", f"seed={'1' * 5000}"), f"...: {WHOLE}"),
     (("demonstrations", "num=²"), f"num=²: {WHOLE}"),
-    (("demonstrations", "sed=1"), "sed: no such option, expected out, num, seed; did you mean seed?"),
+    (("demonstrations", "sed=1"), "sed: no such option, expected kind, out, num, seed; did you mean seed?"),
     (("demonstrations", "seed\n=x"), f"seed=x: {WHOLE}"),
     (("sample", "goal=0.8,0,-0.8,0"), "start: expected the robots' positions, found none"),
     (("sample", "start=a,b", "goal=0,0"), "start=a,b: expected numbers with commas between"),
@@ -379,7 +379,7 @@ OPTIONS = [
     (("evaluate", "run=nobody"), "run=nobody: no such finished run, expected latest, an id, NAME or PRESET/NAME"),
     (("evaluate", "train.lr=1"), "train.lr=1: fixed by the run, expected settings of sample. and seed only"),
     (("evaluate", "sample.steps=0"), f"sample.steps=0: {WHOLE} of at least 1"),
-    (("evaluate", "sample.num=1000000000"), f"sample.num=1000000000: takes 3815{GIB}"),
+    (("evaluate", "sample.num=1000000000"), f"sample.num=1000000000: takes 5723{GIB}"),
     (("evaluate", "seed=3 # ../../x"), f"seed=3 # ../../x: {WHOLE}"),
     (("compare", "format=xml"), "format=xml: expected one of table, markdown, csv, json"),
     (("compare", "preset=it's"), "preset=it's: expected one of long, paper, quick, smoke"),
@@ -388,7 +388,13 @@ OPTIONS = [
     (("train", "preset=smoke", "code=some"), "code=some: expected same or any"),
     (("ablations", "preset=smoke", "code="), "code=: expected same or any"),
     (("figures", "run=nobody"), "run=nobody: no such finished run, expected"),
-    (("figures", "rnu=latest"), "rnu: no such option, expected run; did you mean run?"),
+    (("figures", "rnu=latest"), "rnu: no such option, expected run, split; did you mean run?"),
+    *(
+        ((of_runs, "split=train"), "split=train: expected val or test")
+        for of_runs in ("evaluate", "compare", "figures")
+    ),
+    (("ablations", "split="), "split=: expected val or test"),
+    (("compare", "reference=1", "split=val"), "split=val: expected test with reference=1"),
     (("explain", "preset=quik"), "preset=quik: expected one of long, paper, quick, smoke; did you mean quick?"),
     (("ablations", "jobs=0"), f"jobs=0: {WHOLE} of at least 1 and at most 1024"),
     (("ablations", "seeds=0 x"), f"seed=x: {WHOLE}"),

@@ -163,8 +163,8 @@ def test_a_third_machine_evaluates_and_draws_a_run_and_the_server_keeps_it(
     ended(tmp_path, server, "evaluate", "run=cgp-s0", "sample.steps=3")
     ended(tmp_path, server, "figures", "run=cgp-s0")
     (run,) = server.runs("cgp-s0")
-    assert "evaluate/sample.steps:3/none/robot_collision_rate" in run.data.metrics
-    assert (server.kept(run) / "evaluate" / "sample.steps:3.yaml").exists()
+    assert "evaluate/val sample.steps:3/none/robot_collision_rate" in run.data.metrics
+    assert (server.kept(run) / "evaluate" / "val sample.steps:3.yaml").exists()
     assert (server.kept(run) / "figures" / "guidance.png").read_bytes().startswith(b"\x89PNG")
     assert not (tmp_path / "runs" / "mlflow.db").exists()
 
