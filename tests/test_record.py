@@ -291,3 +291,21 @@ def test_the_results_of_a_split_are_found_where_the_tables_look_for_them() -> No
         "evaluate/seed:8/none/num": 5.0,
         "evaluate/same settings/none/num": 6.0,
     }
+
+
+def test_a_method_on_other_demonstrations_has_a_table_of_its_own_with_their_d_plus() -> None:
+    """What alone is changed is what it learned from, so it is no reading of the paper."""
+    for seed in range(2):
+        published("plus", seed, 5)
+        made = published("plus", seed, 7 + seed, "data.seed=101")
+        feasible = {"without_model/feasible/num": 400, "without_model/feasible/near_count": 100}
+        replace(made, metrics=made.metrics | feasible | {"test/none/near_count": 200}).write(record.FOLDER)
+    published("cgp", 0, 30, "constraint.reduction=closest")
+    (found,) = compare.collect_reference()
+    row = "plus: the best together, data.seed=101"
+    assert cell(found, "5", row, "none: robot").count == 15
+    assert (cell(found, "5", row, "near rate").count, cell(found, "5", row, "near rate").trajectories) == (400, 2000)
+    shown = cell(found, "5", "no model: feasible, data.seed=101", "near rate")
+    assert (shown.count, shown.trajectories) == (100, 400), "once, though both seeds have it"
+    assert {one.row for one in found.cells if one.table == "4"} & {row} == set()
+    assert found.commands[row] == "make ablations ABLATIONS=plus SEEDS=\"0 1\" PRESET=quick ARGS='data.seed=101'"

@@ -61,6 +61,20 @@ GUARDS = {
     "test/none/path_length_median": "path length, median",
     "test/none/success": "success rate",
     "test/none/outside": "outside rate",
+    "test/none/near": "near rate",
+}
+# On demonstrations of other seeds and kinds: what is kept under every setting, and how near to D+ it comes.
+ELSEWHERE = {
+    "test/none/robot_collision": "none: robot",
+    "test/robot/robot_collision": "robot: robot",
+    "test/obstacle/robot_collision": "obstacle: robot",
+    "test/obstacle/object_collision": "obstacle: object",
+    "test/none/success": "none: success",
+    "test/robot/success": "robot: success",
+    "test/obstacle/success": "obstacle: success",
+    "test/none/near": "near rate",
+    "test/none/smoothness_median": "smoothness, median",
+    "test/none/energy_distance": "energy distance to held-out D+",
 }
 READINGS = {
     "none/robot_collision": "none: robot",
@@ -129,7 +143,9 @@ def tables(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]
         runs: by ablation, a run for each seed.
         readings: runs with changed settings, by what is changed.
     """
-    cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *_table_4(runs, readings)]
+    elsewhere = {name: of_row for name, of_row in readings.items() if _on_other_data(of_row[0])}
+    read = {name: of_row for name, of_row in readings.items() if name not in elsewhere}
+    cells = [*_table_1(runs), *_table_2(runs), *_table_3(runs), *_table_4(runs, read), *_table_5(elsewhere)]
     return [cell for cell in cells if cell is not None]
 
 
@@ -172,6 +188,24 @@ def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Recor
         for row, prefix, of_row in rows
         for metric, column in READINGS.items()
     ]
+
+
+def _on_other_data(run: Record) -> bool:
+    """Whether all that is changed about a run is what it learned from."""
+    return all(change.startswith("data.") for change in run.changes)
+
+
+def _table_5(elsewhere: Mapping[str, list[Record]]) -> list[Cell | None]:
+    """Methods on other demonstrations, each set with its own D+ below."""
+    cells = []
+    for name, of_row in elsewhere.items():
+        cells += [cell("5", name, column, None, metric, of_row) for metric, column in ELSEWHERE.items()]
+        demonstrations = f"{BASELINE}feasible, {' '.join(of_row[0].changes)}"
+        for metric, column in ELSEWHERE.items():
+            if metric.startswith("test/none/"):
+                baseline = metric.replace("test/none/", "without_model/feasible/")
+                cells.append(cell("5", demonstrations, column, None, baseline, of_row[:1]))
+    return cells
 
 
 def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, list[Record]]) -> list[Cell | None]:

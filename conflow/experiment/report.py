@@ -11,7 +11,17 @@ from typing import Any, Literal, cast, get_args
 from rich.console import Console
 from rich.table import Table
 
-from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell, digits
+from conflow.experiment.cells import (
+    COLLISIONS,
+    ELSEWHERE,
+    GUARDS,
+    METHODS,
+    QUALITIES,
+    READINGS,
+    SMOOTHNESS,
+    Cell,
+    digits,
+)
 from conflow.experiment.claims import Claim
 from conflow.experiment.compare import Comparison
 from conflow.experiment.config import SPLITS, ConfigError
@@ -186,6 +196,7 @@ def _sheets(comparison: Comparison) -> list[Sheet]:
         _methods_across(comparison, "2", "Table 2: sources, without guidance", QUALITIES | SMOOTHNESS),
         _methods_down(comparison, "3", "Table 3: quality without guidance", GUARDS),
         _methods_down(comparison, "4", "Table 4: what the paper leaves open, changed one at a time", READINGS),
+        _methods_down(comparison, "5", "Table 5: other demonstrations", ELSEWHERE),
         (
             "Claims, the paper's first",
             ["claim", "verdict", "p", "corrected p", "values"],
