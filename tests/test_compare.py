@@ -23,7 +23,7 @@ from tests.conftest import Command
 
 MEASURED = tuple(f"{split}/{setting}" for split in ("test", "validation") for setting in ("none", "robot", "obstacle"))
 GROUPS = (*MEASURED, *(f"without_model/{of}" for of in ("data", "feasible", "source")))
-RATES = ("robot_collision", "object_collision", "success", "outside")
+RATES = ("robot_collision", "object_collision", "success", "outside", "near")
 OTHERS = {key.rsplit("/", 1)[1] for key in (*QUALITIES, *GUARDS)} - {*RATES}
 
 
@@ -234,7 +234,7 @@ def test_table_3_guards_every_ablation_and_what_no_model_touched(comparison: Com
 @pytest.fixture(scope="module")
 def patchy(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     """Runs of three versions: the oldest first in the table, and one seed of the second that is old."""
-    guards = ("energy_distance", "path_length_median", "success", "outside")
+    guards = ("energy_distance", "path_length_median", "success", "outside", "near")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
         monkeypatch.chdir(tmp_path_factory.mktemp("patchy"))
