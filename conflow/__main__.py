@@ -163,7 +163,7 @@ def demonstrations(arguments: list[str]) -> None:
     from conflow.experiment import config, signals
 
     signals.raise_on_signals()
-    defaults = {"kind": "passing", "out": "", "num": "3000", "seed": "0"}
+    defaults = {"kind": "passing", "out": "KIND.npz", "num": "3000", "seed": "0"}
     options, _ = config.options(arguments, defaults, settings=False)
     num, seed = config.whole(options, "num", 10, 10**5), config.whole(options, "seed", 0, 2**32 - 1)
 
@@ -173,7 +173,7 @@ def demonstrations(arguments: list[str]) -> None:
     if kind not in KINDS:
         offer = config.nearest(kind, list(KINDS))
         raise config.ConfigError(f"kind={config.brief(kind)}: expected {' or '.join(KINDS)}{offer}")
-    out = options["out"] or f"{kind}.npz"
+    out = f"{kind}.npz" if options["out"] == defaults["out"] else options["out"]
     save(out, KINDS[kind](num, seed=seed))
     print(f"Written: {out}; train on it with: make train ARGS=data.path={out}")
 
