@@ -309,3 +309,15 @@ def test_a_method_on_other_demonstrations_has_a_table_of_its_own_with_their_d_pl
     assert (shown.count, shown.trajectories) == (100, 400), "once, though both seeds have it"
     assert {one.row for one in found.cells if one.table == "4"} & {row} == set()
     assert found.commands[row] == "make ablations ABLATIONS=plus SEEDS=\"0 1\" PRESET=quick ARGS='data.seed=101'"
+
+
+def test_a_row_that_was_sampled_again_is_of_the_seeds_that_were() -> None:
+    """One of two networks sampled with other settings is a row of one seed, and not none."""
+    published("plus", 0, 5)
+    made = published("plus", 1, 5)
+    plain = {key: value for key, value in made.metrics.items() if not key.startswith("evaluate/")}
+    replace(made, metrics=plain).write(record.FOLDER)
+    (found,) = compare.collect_reference()
+    row = "plus: the best together, sample.solver:rk4"
+    assert (cell(found, "4", row, "none: robot").seeds, cell(found, "4", row, "none: robot").count) == (1, 5)
+    assert "for s in 0; do make evaluate" in found.commands[row]

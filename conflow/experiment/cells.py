@@ -180,7 +180,10 @@ def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Recor
     """ConFlow under other readings: trained with them, or, where that is enough, sampled and judged again with them."""
     rows = [("default", "test/", runs.get("cgp", [])), *((name, "test/", of_row) for name, of_row in readings.items())]
     for name, of_row in runs.items():
-        rows += [(f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", of_row) for label in labels(of_row)]
+        rows += [
+            (f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", labelled(of_row, label))
+            for label in labels(of_row)
+        ]
     if len(rows) == 1:
         return []
     return [
@@ -288,6 +291,11 @@ def _value(metric: str, run: Record) -> float:
 
 def _trajectories(metric: str, run: Record) -> int:
     return int(run.metrics[metric.rsplit("/", 1)[0] + "/num"])
+
+
+def labelled(runs: Sequence[Record], label: str) -> list[Record]:
+    """Those of the runs that were sampled again with these settings."""
+    return [one for one in runs if any(key.startswith(f"evaluate/{label}/") for key in one.metrics)]
 
 
 def labels(runs: Sequence[Record]) -> list[str]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from conflow.experiment import code, config, paper, record
-from conflow.experiment.cells import BASELINE, COLLISIONS, METHODS, Cell, labels, tables
+from conflow.experiment.cells import BASELINE, COLLISIONS, METHODS, Cell, labelled, labels, tables
 from conflow.experiment.claims import Claim, claims
 from conflow.experiment.config import SPLITS, ConfigError, SplitName
 from conflow.experiment.record import Record
@@ -165,8 +165,8 @@ def _commands(
     for ablation, of_row in runs.items():
         name, again = METHODS.get(ablation, ablation), _command(of_row)
         found |= {name: again, f"{BASELINE}source {ablation}": again}
-        seeds = " ".join(str(one.seed) for one in of_row)
         for label in labels(of_row):
+            seeds = " ".join(str(one.seed) for one in labelled(of_row, label))
             arguments = "" if label == record.UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
             run = f"{of_row[0].preset}/{ablation}-s$s"
             evaluated = f"for s in {seeds}; do make evaluate RUN={run} SPLIT={split}{arguments}; done"
