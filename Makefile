@@ -63,7 +63,7 @@ demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FIL
 	@$(CONFLOW) demonstrations kind=$(KIND) $(WRITTEN) seed=$(SEED)
 
 bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)
-	@$(CONFLOW) bench format=$(FORMAT) $(if $(REFERENCE),reference=1)
+	@$(PYTHON) -m tests.bench format=$(FORMAT) $(if $(REFERENCE),reference=1)
 
 ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
 	@$(CONFLOW) ui port=$(PORT)

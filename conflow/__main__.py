@@ -8,28 +8,33 @@ import textwrap
 import traceback
 from typing import TYPE_CHECKING, NoReturn
 
+from conflow import errors
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rich.console import Console
 
 
 def train(arguments: list[str]) -> None:
     """Train, sample, evaluate and track one experiment, split=val to print; or go on with one: resume=RUN, code=any."""
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
+    from conflow.training import config, memory
 
     signals.raise_on_signals()
     # First of all, and with little imported, so that a mistyped setting is answered at once.
-    options, rest = config.options(arguments, {"resume": "", "code": "same", "split": "val"})
-    any_code, split = _any_code(options), config.held_out(options)
+    options, rest = commandline.options(arguments, {"resume": "", "code": "same", "split": "val"})
+    any_code, split = _any_code(options), commandline.held_out(options)
     settings = config.load(rest)
-    config.check_training(settings)
+    memory.check_training(settings)
 
-    from conflow.experiment.train import train
+    from conflow.figures.workspace import of_training
+    from conflow.training.train import train
 
-    console = _console()
-    run_id = train(settings, console, options["resume"], any_code, split)
-    console.print(f"Run {run_id} is finished. Look at it with: make ui", highlight=False)
+    terminal = console()
+    run_id = train(settings, terminal, options["resume"], any_code, split, of_training)
+    terminal.print(f"Run {run_id} is finished. Look at it with: make ui", highlight=False)
 
 
 def ablations(arguments: list[str]) -> None:
@@ -37,31 +42,34 @@ def ablations(arguments: list[str]) -> None:
 
     Methods are chosen by the validation split: split=val.
     """
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
+    from conflow.training import config, memory
 
     signals.raise_on_signals()
     defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
-    options, settings = config.options(arguments, defaults | {"code": "same", "split": "val"})
-    any_code, split = _any_code(options), config.held_out(options)
-    jobs = config.whole(options, "jobs", 1, 1024)
+    options, settings = commandline.options(arguments, defaults | {"code": "same", "split": "val"})
+    any_code, split = _any_code(options), commandline.held_out(options)
+    jobs = commandline.whole(options, "jobs", 1, 1024)
     for key in ("seeds", "ablations"):
         if not options[key].split():
-            raise config.ConfigError(f"{key}={options[key]}: expected at least one")
+            raise errors.ConfigError(f"{key}={options[key]}: expected at least one")
     wanted = [f"preset={options['preset']}", *settings]
-    config.check_training(config.load(wanted))
+    memory.check_training(config.load(wanted))
 
-    from conflow.experiment import compare, grid, report
+    from conflow.grid import local
+    from conflow.results import comparison, printing
 
-    console = _console()
-    failed = grid.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, console, any_code)
-    report.render([compare.collect(options["preset"], settings, split)], "table", console)
+    terminal = console()
+    failed = local.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, terminal, any_code)
+    printing.render([comparison.collect(options["preset"], settings, split)], "table", terminal)
     if failed:
-        raise config.ConfigError(f"{failed} cells failed; the same command tries them again")
+        raise errors.ConfigError(f"{failed} cells failed; the same command tries them again")
 
 
 def _any_code(options: "Mapping[str, str]") -> bool:
     """Whether runs of other code than the present are to be taken for those that are asked for."""
-    from conflow.experiment.config import ConfigError
+    from conflow.errors import ConfigError
 
     if options["code"] not in ("same", "any"):
         raise ConfigError(f"code={options['code']}: expected same or any")
@@ -70,60 +78,68 @@ def _any_code(options: "Mapping[str, str]") -> bool:
 
 def evaluate(arguments: list[str]) -> None:
     """Sample a finished run again with other settings, and add the results: run=latest split=val sample....= seed=."""
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
 
     signals.raise_on_signals()
-    options, settings = config.options(arguments, {"run": "latest", "split": "val"})
-    split = config.held_out(options)
+    options, settings = commandline.options(arguments, {"run": "latest", "split": "val"})
+    split = commandline.held_out(options)
 
-    from conflow.experiment.finished import evaluate_again
+    from conflow.training.reload import evaluate_again
 
-    evaluate_again(options["run"], settings, split, _console())
+    evaluate_again(options["run"], settings, split, console())
 
 
 def compare(arguments: list[str]) -> None:
     """Print tables and claims of finished runs: preset=quick split=val format=table; reference=1: published ones."""
-    from conflow.experiment import compare, config, report
+    from conflow import commandline
+    from conflow.results import comparison, printing
+    from conflow.training import config
 
-    options, settings = config.options(arguments, {"preset": "quick", "format": "table", "reference": "0", "split": ""})
-    of_record = bool(config.whole(options, "reference", 0, 1))
+    options, settings = commandline.options(
+        arguments, {"preset": "quick", "format": "table", "reference": "0", "split": ""}
+    )
+    of_record = bool(commandline.whole(options, "reference", 0, 1))
     options["split"] = options["split"] or ("test" if of_record else "val")
-    split = config.held_out(options)
+    split = commandline.held_out(options)
     if of_record and split != "test":
-        raise config.ConfigError(f"split={split}: expected test with reference=1, which is what records publish")
+        raise errors.ConfigError(f"split={split}: expected test with reference=1, which is what records publish")
     config.load([f"preset={options['preset']}", *settings])  # of a mistyped one there are no runs either
 
-    form = report.checked_format(options["format"])
-    found = compare.collect_reference() if of_record else [compare.collect(options["preset"], settings, split)]
-    report.render(found, form, _console())
+    form = printing.checked_format(options["format"])
+    found = comparison.collect_reference() if of_record else [comparison.collect(options["preset"], settings, split)]
+    printing.render(found, form, console())
 
 
 def reference(arguments: list[str]) -> None:
     """Write the numbers of a preset's newest finished runs into runs/reference/runs/, a file each: preset=quick."""
-    from conflow.experiment import config
+    from conflow import commandline
+    from conflow.training import config
 
-    options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
+    options, _ = commandline.options(arguments, {"preset": "quick"}, settings=False)
     config.load([f"preset={options['preset']}"])
 
-    from conflow.experiment import record
+    from conflow.results import records
 
-    paths = record.publish(options["preset"])
-    print(f"Written: {len(paths)} files in {record.FOLDER}")
+    paths = records.publish(options["preset"])
+    print(f"Written: {len(paths)} files in {records.FOLDER}")
 
 
 def sample(arguments: list[str]) -> None:
     """Plan from start= to goal= and draw it: run=latest out=plans.npz num=64 seed=0 guidance=both obstacle=x,y,r."""
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
+    from conflow.training import config
 
     signals.raise_on_signals()
     defaults = {"run": "latest", "out": "plans.npz", "num": "64", "guidance": "both", "seed": "0"}
-    options, _ = config.options(arguments, {"start": "", "goal": "", "obstacle": ""} | defaults, settings=False)
+    options, _ = commandline.options(arguments, {"start": "", "goal": "", "obstacle": ""} | defaults, settings=False)
     # The one option that may be given several times.
     obstacles = [value for key, value in map(config.split, arguments) if key == "obstacle"]
     for key in ("start", "goal"):
         if not options[key]:
             example = 'make sample START="-0.8,0,0.8,0" GOAL="0.8,0,-0.8,0"'
-            raise config.ConfigError(f"{key}: expected the robots' positions, found none; try: {example}")
+            raise errors.ConfigError(f"{key}: expected the robots' positions, found none; try: {example}")
 
     from conflow import planner
 
@@ -132,80 +148,64 @@ def sample(arguments: list[str]) -> None:
 
 def figures(arguments: list[str]) -> None:
     """Draw the pictures of finished runs into runs/figures/: split=val, run=latest, or NAME,NAME,... to compare too."""
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
 
     signals.raise_on_signals()
-    options, _ = config.options(arguments, {"run": "latest", "split": "val"}, settings=False)
-    split = config.held_out(options)
+    options, _ = commandline.options(arguments, {"run": "latest", "split": "val"}, settings=False)
+    split = commandline.held_out(options)
 
-    from conflow.experiment.figures import gallery
+    from conflow.figures import gallery
 
-    gallery.draw(options["run"].split(","), split, _console())
+    gallery.draw(options["run"].split(","), split, console())
 
 
 def explain(arguments: list[str]) -> None:
     """Draw why the covariant correction works, and what fewer collisions cost the published runs: preset=quick."""
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
+    from conflow.training import config
 
     signals.raise_on_signals()
-    options, _ = config.options(arguments, {"preset": "quick"}, settings=False)
+    options, _ = commandline.options(arguments, {"preset": "quick"}, settings=False)
     settings = config.load([f"preset={options['preset']}"])
 
-    from conflow.experiment.figures import explain, gallery
+    from conflow.figures import explain, gallery
 
-    console = _console()
-    gallery.draw_front(console)
-    explain.draw(settings, console)
+    terminal = console()
+    gallery.draw_front(terminal)
+    explain.draw(settings, terminal)
 
 
 def demonstrations(arguments: list[str]) -> None:
     """Write demonstrations of another kind, for data.path: kind=passing, or social, out=KIND.npz num=3000 seed=0."""
-    from conflow.experiment import config, signals
+    from conflow import commandline
+    from conflow.tracking import signals
 
     signals.raise_on_signals()
     defaults = {"kind": "passing", "out": "KIND.npz", "num": "3000", "seed": "0"}
-    options, _ = config.options(arguments, defaults, settings=False)
-    num, seed = config.whole(options, "num", 10, 10**5), config.whole(options, "seed", 0, 2**32 - 1)
+    options, _ = commandline.options(arguments, defaults, settings=False)
+    num, seed = commandline.whole(options, "num", 10, 10**5), commandline.whole(options, "seed", 0, 2**32 - 1)
 
     from conflow.scene.trajectories import KINDS, save
 
     kind = options["kind"]
     if kind not in KINDS:
-        offer = config.nearest(kind, list(KINDS))
-        raise config.ConfigError(f"kind={config.brief(kind)}: expected {' or '.join(KINDS)}{offer}")
+        offer = errors.nearest(kind, list(KINDS))
+        raise errors.ConfigError(f"kind={errors.brief(kind)}: expected {' or '.join(KINDS)}{offer}")
     out = f"{kind}.npz" if options["out"] == defaults["out"] else options["out"]
     save(out, KINDS[kind](num, seed=seed))
     print(f"Written: {out}; train on it with: make train ARGS=data.path={out}")
 
 
-def bench(arguments: list[str]) -> None:
-    """Measure how fast everything is, beside what a user would take instead: format=table; reference=1: of record."""
-    from conflow.experiment import config, signals
-
-    signals.raise_on_signals()
-    options, _ = config.options(arguments, {"format": "table", "reference": "0"}, settings=False)
-    of_record = bool(config.whole(options, "reference", 0, 1))
-
-    from conflow.experiment import report
-
-    form = report.checked_format(options["format"])
-
-    from conflow.bench import suite, table
-
-    console = _console()
-    path = suite.REFERENCE if of_record else suite.measure(console)
-    table.render(suite.Bench.read(path), form, console)
-    print(f"{'Read from' if of_record else 'Written'}: {path}", file=sys.stderr)
-
-
 def ui(arguments: list[str]) -> None:
     """Serve MLflow's pages of all runs on this machine: port=5000."""
-    from conflow.experiment import config
+    from conflow import commandline
 
-    options, _ = config.options(arguments, {"port": "5000"}, settings=False)
-    port = config.whole(options, "port", 1, 65535)
+    options, _ = commandline.options(arguments, {"port": "5000"}, settings=False)
+    port = commandline.whole(options, "port", 1, 65535)
 
-    from conflow.experiment import ui
+    from conflow.tracking import ui
 
     ui.serve(port)
 
@@ -220,7 +220,6 @@ COMMANDS = {
     "figures": figures,
     "explain": explain,
     "demonstrations": demonstrations,
-    "bench": bench,
     "ui": ui,
 }
 
@@ -234,8 +233,6 @@ class Parser(argparse.ArgumentParser):
 
 def main() -> None:
     """Run one command; exit with 0, with 2 and one line for a known failure, or with 128 + a signal."""
-    from conflow.experiment import signals
-
     parser = Parser("conflow", description="Constraint-guided flow matching for robot motion.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, function in COMMANDS.items():
@@ -244,25 +241,33 @@ def main() -> None:
             "settings", nargs="*", metavar="key=value", help="options, or settings, see conf/base.yaml"
         )
     arguments = parser.parse_args()
+    guarded(COMMANDS[arguments.command], arguments.settings)
+
+
+def guarded(command: "Callable[[list[str]], None]", arguments: list[str]) -> None:
+    """Run a command; end the process with one line where it fails in a known way."""
+    from conflow.tracking import signals
+
     try:
-        COMMANDS[arguments.command](arguments.settings)
+        command(arguments)
         signals.check()
         sys.stdout.flush()  # what the output says to this is said here, not after the end
     except BaseException as error:
         sys.exit(_exit_code(error))
 
 
-def _console() -> "Console":
+def console() -> "Console":
+    """Where commands print."""
     from rich.console import Console
 
     # Without a terminal rich assumes 80 columns, in which the tables would be all line breaks.
-    console = Console()
-    return console if console.is_terminal else Console(width=140)
+    found = Console()
+    return found if found.is_terminal else Console(width=140)
 
 
 def _exit_code(error: BaseException) -> int:
     """Known failures end in one line on stderr and an exit code; anything else is a bug and raised."""
-    from conflow.experiment import signals
+    from conflow.tracking import signals
 
     if interrupted := signals.arrived():
         print(f"conflow: interrupted by {interrupted}", file=sys.stderr)
@@ -280,7 +285,7 @@ def _exit_code(error: BaseException) -> int:
 
 def _reason(error: BaseException) -> str | None:
     """What a known failure says; None of any other."""
-    from conflow.experiment.config import ConfigError
+    from conflow.errors import ConfigError
     from conflow.scene.trajectories import DemonstrationError
 
     if isinstance(error, ConfigError | DemonstrationError):

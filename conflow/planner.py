@@ -22,18 +22,20 @@ from numpy.typing import ArrayLike
 from sqlalchemy.exc import SQLAlchemyError
 from torch import Tensor
 
-from conflow.experiment import config
-from conflow.experiment.build import obstacle_avoidance, random_stream
-from conflow.experiment.config import ConfigError, Range, brief, check_memory, nearest
-from conflow.experiment.figures.workspace import COLLISION, OBSTACLE, ROBOTS
-from conflow.experiment.finished import MODEL_FILE, load_model
-from conflow.experiment.metrics import leaves_workspace, smoothness, wilson
-from conflow.experiment.module import ConFlow, start_and_goal
-from conflow.experiment.tracking import artifact, find_run
+from conflow import commandline
+from conflow.errors import ConfigError, brief, nearest
+from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS
 from conflow.flow.correction import Correction
 from conflow.flow.sampler import Field, in_pieces, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, Obstacle, Sum
+from conflow.tracking.store import artifact, find_run
+from conflow.training.build import obstacle_avoidance, random_stream
+from conflow.training.config import Range
+from conflow.training.memory import check_memory
+from conflow.training.metrics import leaves_workspace, smoothness, wilson
+from conflow.training.module import ConFlow, start_and_goal
+from conflow.training.reload import MODEL_FILE, load_model
 
 Guidance = Literal["none", "robot", "obstacle", "both"]
 Numbers = ArrayLike | Tensor
@@ -399,7 +401,7 @@ def sample(options: Mapping[str, str], obstacles: Sequence[str] = ()) -> str:
     out = _new_files(options["out"])
     start, goal = (_parsed(key, options[key]) for key in ("start", "goal"))
     discs = [_parsed("obstacle", text) for text in obstacles]
-    num, seed = config.whole(options, "num", 1, 10**6), config.whole(options, "seed", 0, 2**32 - 1)
+    num, seed = commandline.whole(options, "num", 1, 10**6), commandline.whole(options, "seed", 0, 2**32 - 1)
     guidance = cast(Guidance, options["guidance"])
     plans = Planner.load(options["run"]).plan(start, goal, num, discs, guidance=guidance, seed=seed)
     _save(out, plans, start, goal, [Obstacle(*disc) for disc in discs])

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from conflow.experiment import config, signals
-from conflow.experiment.config import Config
+from conflow.tracking import signals
+from conflow.training import config
+from conflow.training.config import Config
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -10,17 +10,18 @@ import pytest
 import torch
 from rich.console import Console
 
-from conflow.bench import peers, quality, sampling, scaling, suite, table, training, whole
-from conflow.bench.clock import Pace, Row, Target, alone, alternate, beside, block, compared
-from conflow.bench.quality import Curve
-from conflow.bench.suite import Bench
-from conflow.bench.training import RAW, Loop, RawLoop
-from conflow.experiment import config, tracking
-from conflow.experiment.build import build_source
-from conflow.experiment.config import ConfigError
+from conflow.errors import ConfigError
 from conflow.flow.path import interpolate, velocity
 from conflow.flow.sampler import integrate
 from conflow.scene.trajectories import swap
+from conflow.tracking import store
+from conflow.training import config
+from conflow.training.build import build_source
+from tests.bench import peers, quality, sampling, scaling, suite, table, training, whole
+from tests.bench.clock import Pace, Row, Target, alone, alternate, beside, block, compared
+from tests.bench.quality import Curve
+from tests.bench.suite import Bench
+from tests.bench.training import RAW, Loop, RawLoop
 
 ONCE = Pace(rounds=1, at_least=0)
 
@@ -154,7 +155,7 @@ def test_the_loop_is_that_of_training_without_a_validation(elsewhere: Path, smok
         assert loop.run(12) > 0
         assert any(not torch.equal(p, q) for p, q in zip(first, loop.model.v.parameters(), strict=True))
         run_id = str(loop.logger.run_id)
-    history = tracking.client().get_run(run_id).data.metrics
+    history = store.client().get_run(run_id).data.metrics
     assert "train/loss" in history  # logged at step 10
     assert "val/loss" not in history
 
@@ -245,8 +246,8 @@ def test_the_shares_of_a_run_add_up(elsewhere: Path) -> None:
 
 def test_curves_are_those_of_finished_runs_of_an_ablation(elsewhere: Path) -> None:
     """Measured more often a run still counts; with another training, or without its seconds, it does not."""
-    store = tracking.client()
-    experiment = store.get_experiment_by_name("conflow")
+    client = store.client()
+    experiment = client.get_experiment_by_name("conflow")
     assert experiment is not None
     for seed, changes, timed in (
         (0, [], True),
@@ -256,14 +257,14 @@ def test_curves_are_those_of_finished_runs_of_an_ablation(elsewhere: Path) -> No
     ):
         settings = config.load(["preset=smoke", f"seed={seed}", *changes])
         tags = {"ablation": "cgp", "preset": "smoke", "seed": str(seed), "hardware": "a machine", "threads": "2"}
-        run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
+        run_id = client.create_run(experiment.experiment_id, tags=tags).info.run_id
         for key, value in config.flatten(settings.tree()).items():
-            store.log_param(run_id, key, str(value))
+            client.log_param(run_id, key, str(value))
         for step in (10, 20, 30):
-            store.log_metric(run_id, "val/none/robot_collision_count", 7 - step // 10, step=step)
+            client.log_metric(run_id, "val/none/robot_collision_count", 7 - step // 10, step=step)
             if timed and step > 10:
-                store.log_metric(run_id, "train/seconds", step / 10, step=step)
-        store.set_terminated(run_id, "FINISHED")
+                client.log_metric(run_id, "train/seconds", step / 10, step=step)
+        client.set_terminated(run_id, "FINISHED")
     found = quality.curves("smoke")
     assert [(one.ablation, one.seed) for one in found] == [("cgp", 0), ("cgp", 1)]
     assert found[0] == Curve("cgp", 0, [20, 30], [2.0, 3.0], [5, 4], 64, "a machine, 2 threads")

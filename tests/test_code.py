@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from conflow.experiment import code
+from conflow.tracking import code
 from tests.test_layout import imports
 
 CORRECTION = "flow/correction.py"
@@ -48,10 +48,10 @@ def test_what_is_not_executed_does_not_show(package: Path) -> None:
     for path in package.rglob("*.py"):
         path.write_text(f"# A comment.\n\n{path.read_text()}\n\n")
     edit(package / CORRECTION, '"""', '"""Otherwise said. ')
-    edit(package / "experiment" / "evaluation.py", "LATENCY_BATCH = 256\n", 'LATENCY_BATCH = 256\n"""Of latency."""\n')
-    edit(package / "experiment" / "metrics.py", "-> Tensor", '-> "Tensor"')
-    edit(package / "experiment" / "figures" / "workspace.py", "import", "import this\nimport")
-    edit(package / "experiment" / "tracking.py", "FLUSH_SECONDS = 5.0", "FLUSH_SECONDS = 6.0")
+    edit(package / "training" / "evaluation.py", "LATENCY_BATCH = 256\n", 'LATENCY_BATCH = 256\n"""Of latency."""\n')
+    edit(package / "training" / "metrics.py", "-> Tensor", '-> "Tensor"')
+    edit(package / "figures" / "workspace.py", "import", "import this\nimport")
+    edit(package / "tracking" / "recording.py", "FLUSH_SECONDS = 5.0", "FLUSH_SECONDS = 6.0")
     assert changed(package) == set()
 
 
@@ -84,11 +84,16 @@ def test_nothing_that_is_empty_is_part_of_it() -> None:
 
 
 def test_what_trains_and_measures_uses_nothing_of_ours_that_is_left_out() -> None:
-    """But the settings, which are compared by value, and the display. train.py stores and draws as well."""
-    inner = [name for name in code.files() if name != "experiment/train.py"]
+    """But the settings, which are compared by value, what refuses them, and the display. train.py stores as well."""
+    inner = [name for name in code.files() if name != "training/train.py"]
     modules = {f"conflow.{name.removesuffix('.py').replace('/', '.')}".removesuffix(".__init__") for name in inner}
     used = {name for module in modules for name in imports(module) if name.startswith("conflow")}
-    assert used - modules == {"conflow.experiment.config", "conflow.experiment.progress"}
+    assert used - modules == {
+        "conflow.errors",
+        "conflow.training.config",
+        "conflow.training.memory",
+        "conflow.training.progress",
+    }
 
 
 def test_a_run_knows_the_files_in_which_the_present_code_is_another(monkeypatch: pytest.MonkeyPatch) -> None:

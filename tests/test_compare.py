@@ -13,12 +13,14 @@ from mlflow.entities import Metric
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import code, compare, config, report, tracking
-from conflow.experiment.cells import COLLISIONS, GUARDS, METHODS, QUALITIES, Cell
-from conflow.experiment.compare import Comparison
-from conflow.experiment.config import ConfigError
-from conflow.experiment.metrics import wilson
-from conflow.experiment.seeds import LEVEL, holm, rate_interval
+from conflow.errors import ConfigError
+from conflow.results import printing
+from conflow.results.comparison import Comparison, collect
+from conflow.results.statistics import LEVEL, holm, rate_interval
+from conflow.results.tables import COLLISIONS, GUARDS, METHODS, QUALITIES, Cell
+from conflow.tracking import code, store
+from conflow.training import config
+from conflow.training.metrics import wilson
 from tests.conftest import Command
 
 MEASURED = tuple(f"{split}/{setting}" for split in ("test", "validation") for setting in ("none", "robot", "obstacle"))
@@ -42,13 +44,13 @@ def add_run(
 
     It was logged before there were the metrics that it is `lacking`, `by` the code of these tags or the present one.
     """
-    store = tracking.client()
-    experiment = store.get_experiment_by_name("conflow")
+    client = store.client()
+    experiment = client.get_experiment_by_name("conflow")
     assert experiment is not None
     settings = config.load(["preset=smoke", f"ablation={ablation}", f"seed={seed}", *arguments])
     tags = {"ablation": ablation, "preset": "smoke", "seed": str(seed), "config_sha": settings.sha()}
     tags |= code.tags() if by is None else by
-    run_id = store.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
+    run_id = client.create_run(experiment.experiment_id, run_name=f"{ablation}-s{seed}", tags=tags).info.run_id
     values: dict[str, float] = {}
     for group in groups:
         values |= {f"{group}/num": 1000}
@@ -56,8 +58,8 @@ def add_run(
         values |= {f"{group}/{name}": quality for name in OTHERS if name not in lacking}
     values.pop("without_model/feasible/energy_distance", None)
     values |= {key: value + 1 for key, value in values.items() if key.startswith("test/") and key.endswith("_count")}
-    store.log_batch(run_id, metrics=[Metric(key, value, 0, 0) for key, value in values.items()])
-    store.set_terminated(run_id, status)
+    client.log_batch(run_id, metrics=[Metric(key, value, 0, 0) for key, value in values.items()])
+    client.set_terminated(run_id, status)
     return str(run_id)
 
 
@@ -73,7 +75,7 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
             add_run("gaussian", seed, 10, 0.1 + 0.002 * seed)
         add_run("cgp", 3, 999, 9.0, "train.max_steps=7")  # another config
         add_run("cgp", 3, 999, 9.0, status="FAILED")
-        return compare.collect("smoke")
+        return collect("smoke")
 
 
 def cell(comparison: Comparison, table: str, row: str, column: str) -> Cell:
@@ -148,7 +150,7 @@ def test_one_seed_says_nothing_of_another(tmp_path: Path, monkeypatch: pytest.Mo
     add_run("cgp", 0, 10, 0.01)
     add_run("gaussian", 0, 100, 0.9)
     add_run("gaussian", 1, 100, 0.9)
-    found = compare.collect("smoke")
+    found = collect("smoke")
     claims = {claim.text: claim for claim in found.claims}
     for text in ("CGP beats Gaussian: smoothness, median", "CGP beats Gaussian: collision rate"):
         assert (claims[text].verdict, claims[text].p) == ("too few seeds", None)
@@ -169,7 +171,7 @@ def test_seeds_that_differ_more_than_the_methods_decide_nothing(
     for seed, (conflow, fm) in enumerate([(10, 100), (300, 310), (200, 260)]):
         add_run("cgp", seed, conflow, 0.01)
         add_run("fm", seed, fm, 0.01)
-    claims = {claim.text: claim for claim in compare.collect("smoke").claims}
+    claims = {claim.text: claim for claim in collect("smoke").claims}
     found = claims["ConFlow collides less than FM, without guidance"]
     assert found.p is not None
     assert found.p > 0.05
@@ -181,13 +183,13 @@ def test_runs_that_cannot_have_these_arguments_are_passed_over(tmp_path: Path, m
     monkeypatch.chdir(tmp_path)
     add_run("cgp", 0, 10, 0.01, "correction.keep_ends=true")
     add_run("covariant", 0, 10, 0.01)  # which has no ends to keep
-    found = compare.collect("smoke", ["correction.keep_ends=true"])
+    found = collect("smoke", ["correction.keep_ends=true"])
     assert found.runs.keys() == {"cgp"}
 
 
-def rendered(comparison: Comparison, form: report.Format) -> str:
+def rendered(comparison: Comparison, form: printing.Format) -> str:
     console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
-    report.render([comparison], form, console)
+    printing.render([comparison], form, console)
     return console.export_text()
 
 
@@ -200,7 +202,7 @@ def test_json_holds_everything_and_csv_every_cell(comparison: Comparison) -> Non
 
 
 @pytest.mark.parametrize("form", ["table", "markdown"])
-def test_a_rate_is_never_shown_without_interval_seeds_and_count(comparison: Comparison, form: report.Format) -> None:
+def test_a_rate_is_never_shown_without_interval_seeds_and_count(comparison: Comparison, form: printing.Format) -> None:
     text = rendered(comparison, form)
     low, high = rate_interval([20, 21, 22, 23], [1000] * 4)
     for shown in (f"0.0215 [{low:.4f}, {high:.4f}]", "86 of 4000", "paper 0.016, not", "4 seeds, 4000 traj"):
@@ -239,12 +241,12 @@ def patchy(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
         monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
         monkeypatch.chdir(tmp_path_factory.mktemp("patchy"))
         monkeypatch.setitem(METHODS, "removed", "an ablation whose file is gone, with a run")
-        tracking.client().set_tag(add_run("cgp", 7, 10, 0.1), "ablation", "removed")
+        store.client().set_tag(add_run("cgp", 7, 10, 0.1), "ablation", "removed")
         for seed in range(2):
             add_run("cgp", seed, 20, 0.01, lacking=(*guards, "smoothness_median", "robot_collision"))
             add_run("fm", seed, 40, 0.1, lacking=guards if seed else ())
             add_run("gaussian", seed, 30, 0.2)
-        return compare.collect("smoke")
+        return collect("smoke")
 
 
 def test_a_metric_that_a_run_lacks_leaves_its_cells_out_and_no_others(patchy: Comparison) -> None:
@@ -265,13 +267,13 @@ def test_a_claim_on_a_metric_that_a_run_lacks_says_so(patchy: Comparison) -> Non
 
 
 @pytest.mark.parametrize("form", ["table", "markdown", "csv", "json"])
-def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: report.Format) -> None:
+def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: printing.Format) -> None:
     text = rendered(patchy, form)
     if form == "markdown":
         _, table_3 = text.split("**Table 3")
         header, _, old, *_ = [line.split("|")[1:-1] for line in table_3.splitlines() if line.startswith("|")]
         # In the order of the metrics, although the first row has the third alone.
-        assert [name.strip() for name in header[1:]] == [*GUARDS.values(), report.AGAIN]
+        assert [name.strip() for name in header[1:]] == [*GUARDS.values(), printing.AGAIN]
         assert [bool(value.strip()) for value in old[1:-1]] == [name == "diversity" for name in GUARDS.values()]
     elif form == "csv":
         assert len(text.split()) > len(patchy.cells)
@@ -279,8 +281,8 @@ def test_missing_cells_are_blank_in_every_format(patchy: Comparison, form: repor
         assert len(json.loads(text)["cells"]) == len(patchy.cells)
 
 
-@pytest.mark.parametrize("form", get_args(report.Format))
-def test_without_a_single_cell_the_claims_are_left(comparison: Comparison, form: report.Format) -> None:
+@pytest.mark.parametrize("form", get_args(printing.Format))
+def test_without_a_single_cell_the_claims_are_left(comparison: Comparison, form: printing.Format) -> None:
     text = rendered(replace(comparison, cells=[], reasons={}), form)
     assert "table,row" in text if form == "csv" else "no finished run of plus" in text
     assert "Table" not in text
@@ -301,7 +303,7 @@ def test_without_runs_the_way_to_some_is_named(tmp_path: Path, monkeypatch: pyte
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="preset=paper: no run at this preset has finished; try: make ablations"):
-        compare.collect("paper")
+        collect("paper")
 
 
 def test_runs_of_the_present_code_come_before_newer_ones_and_others_are_named(
@@ -313,14 +315,14 @@ def test_runs_of_the_present_code_come_before_newer_ones_and_others_are_named(
     add_run("cgp", 0, 10, 0.01)
     add_run("cgp", 0, 900, 0.9, by=other)  # newer
     add_run("fm", 0, 40, 0.1)
-    assert compare.collect("smoke").code == ""
-    assert cell(compare.collect("smoke"), "1", "ConFlow (D+ and D-)", "none: robot").count == 10
+    assert collect("smoke").code == ""
+    assert cell(collect("smoke"), "1", "ConFlow (D+ and D-)", "none: robot").count == 10
     add_run("cgp", 1, 20, 0.01, by=other)  # there is no other of this seed
     add_run("gaussian", 0, 20, 0.01, by={})
-    found = compare.collect("smoke")
+    found = collect("smoke")
     said = "Trained by other code than the present: cgp-s1 (flow/path.py); gaussian-s0 (unknown files)"
     assert found.code == said
-    for form in get_args(report.Format):
+    for form in get_args(printing.Format):
         assert said in rendered(found, form) + capsys.readouterr().err
     assert len(list(csv.reader(io.StringIO(rendered(found, "csv"))))[-1]) == len(fields(Cell)), "cells alone"
 
@@ -334,7 +336,7 @@ def test_each_split_is_compared_for_itself_and_named_in_every_title(
         add_run("cgp", seed, 300, 0.01)
         add_run("fm", seed, 40, 0.01)
     for (split, name), count in zip(config.SPLITS.items(), (600, 602), strict=True):
-        found = compare.collect("smoke", split=split)
+        found = collect("smoke", split=split)
         assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").count == count
         text = rendered(found, "markdown")
         titles = [line for line in text.splitlines() if line.startswith("**")]
@@ -352,10 +354,10 @@ def test_runs_that_were_not_measured_on_a_split_are_left_out_and_named(
     monkeypatch.chdir(tmp_path)
     add_run("cgp", 0, 20, 0.01, groups=["test/none"])
     with pytest.raises(ConfigError, match=r"no finished run was measured on the validation split.*split=test"):
-        compare.collect("smoke")
-    assert compare.collect("smoke", split="test").left_out == []
+        collect("smoke")
+    assert collect("smoke", split="test").left_out == []
     add_run("cgp", 1, 30, 0.01)
-    found = compare.collect("smoke")
+    found = collect("smoke")
     assert cell(found, "1", "ConFlow (D+ and D-)", "none: robot").seeds == 1
     assert "Not measured on the validation split, and left out: cgp-s0; try: split=test" in rendered(found, "table")
 

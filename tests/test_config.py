@@ -4,8 +4,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from conflow.experiment import config
-from conflow.experiment.config import CONF, SIZES, ConfigError
+from conflow.errors import ConfigError
+from conflow.training import config
+from conflow.training.config import CONF, SIZES
 
 # What each ablation may change of the defaults; "changing only what its name says".
 CHANGES = {

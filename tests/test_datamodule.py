@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from conflow.experiment import config
-from conflow.experiment.build import robot_avoidance
-from conflow.experiment.config import Config
-from conflow.experiment.datamodule import Batches, DemonstrationData, Split
 from conflow.scene.trajectories import DemonstrationError, swap
+from conflow.training import config
+from conflow.training.build import robot_avoidance
+from conflow.training.config import Config
+from conflow.training.datamodule import Batches, DemonstrationData, Split
 
 
 def rows(split: Split) -> set[bytes]:

@@ -14,9 +14,6 @@ import torch
 from torch import Tensor
 
 from conflow import __main__ as command_line
-from conflow.experiment import config, signals
-from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.metrics import smoothness
 from conflow.flow.source import cgp, fit_rbf
 from conflow.scene.social_force import Robots, walk
 from conflow.scene.trajectories import (
@@ -31,6 +28,10 @@ from conflow.scene.trajectories import (
     social,
     swap,
 )
+from conflow.tracking import signals
+from conflow.training import config
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.metrics import smoothness
 
 
 def nearest(x: Tensor) -> Tensor:

@@ -6,14 +6,14 @@ from typing import cast
 import pytest
 import torch
 
-from conflow.experiment import config
-from conflow.experiment.build import random_stream
-from conflow.experiment.diagnostics import by_evaluations, collisions_by_weight, guidance, taken_back
-from conflow.experiment.metrics import smoothness
-from conflow.experiment.module import SETTINGS, ConFlow, Setting
 from conflow.flow.network import ResMLP
 from conflow.flow.sampler import Solver, integrate
 from conflow.scene.trajectories import swap
+from conflow.training import config
+from conflow.training.build import random_stream
+from conflow.training.diagnostics import by_evaluations, collisions_by_weight, guidance, taken_back
+from conflow.training.metrics import smoothness
+from conflow.training.module import SETTINGS, ConFlow, Setting
 
 STEPS = 10
 

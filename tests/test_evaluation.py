@@ -10,15 +10,15 @@ from lightning.pytorch.loggers import Logger
 from rich.console import Console
 from torch import Tensor
 
-from conflow.experiment import config, report
-from conflow.experiment.datamodule import DemonstrationData, Split
-from conflow.experiment.evaluation import Evaluation, cycle, evaluate
-from conflow.experiment.module import SETTINGS, ConFlow
-from conflow.experiment.progress import ProgressDisplay
-from conflow.experiment.train import trainer
 from conflow.scene.constraint import RobotAvoidance
 from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import swap
+from conflow.training import config, summary
+from conflow.training.datamodule import DemonstrationData, Split
+from conflow.training.evaluation import Evaluation, cycle, evaluate
+from conflow.training.module import SETTINGS, ConFlow
+from conflow.training.progress import ProgressDisplay
+from conflow.training.train import trainer
 
 
 def model() -> ConFlow:
@@ -157,5 +157,5 @@ def test_too_few_demonstrations_leave_the_energy_distance_out(feasible: int, inf
     assert ("feasible" in found.baseline) == (feasible > 1)
     assert ("energy_distance" in found.results["none"]) == (feasible > 1)
     console = Console(file=io.StringIO(), record=True, width=200)
-    console.print(report.results_table(found.results, "few"))
+    console.print(summary.results_table(found.results, "few"))
     assert "energy distance" in console.export_text()

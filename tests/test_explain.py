@@ -11,19 +11,19 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from conflow.experiment import config
-from conflow.experiment.build import build_source, robot_avoidance
-from conflow.experiment.cells import METHODS, Cell
-from conflow.experiment.claims import Claim
-from conflow.experiment.closed_form import expected, minimiser, posterior
-from conflow.experiment.compare import Comparison
-from conflow.experiment.config import Config
-from conflow.experiment.figures import explain, gallery
-from conflow.experiment.figures.explain import Gap, clearing_time, clearing_times, demonstrations
-from conflow.experiment.figures.front import DISTANCE, RATE, front
+from conflow.figures import explain, gallery
+from conflow.figures.explain import Gap, clearing_time, clearing_times, demonstrations
+from conflow.figures.front import DISTANCE, RATE, front
 from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter
+from conflow.results.claims import Claim
+from conflow.results.comparison import Comparison
+from conflow.results.tables import METHODS, Cell
 from conflow.scene.constraint import Barrier
+from conflow.training import config
+from conflow.training.build import build_source, robot_avoidance
+from conflow.training.closed_form import expected, minimiser, posterior
+from conflow.training.config import Config
 from tests.conftest import Command
 
 

@@ -15,16 +15,18 @@ from mlflow.entities import Run
 from rich.console import Console
 from torch import Tensor
 
-from conflow.experiment import config, figures, tracking
-from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.diagnostics import guidance
-from conflow.experiment.evaluation import Evaluation, cycle
-from conflow.experiment.figures import curves, gallery, workspace
-from conflow.experiment.figures.animation import animation, frames
-from conflow.experiment.finished import demonstrations
-from conflow.experiment.metrics import smoothness, wilson
-from conflow.experiment.module import SETTINGS, ConFlow
+from conflow.figures import curves, gallery, workspace
+from conflow.figures.animation import animation, frames
 from conflow.flow.sampler import integrate
+from conflow.tracking import recording, store
+from conflow.training import config
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.diagnostics import guidance
+from conflow.training.evaluation import Evaluation, cycle
+from conflow.training.metrics import smoothness, wilson
+from conflow.training.module import SETTINGS, ConFlow
+from conflow.training.reload import demonstrations
+from conflow.training.train import experiment
 from tests.conftest import Command
 
 
@@ -71,7 +73,7 @@ def distance(x: Tensor) -> Tensor:
 
 
 def test_demonstrations_are_drawn_apart_by_their_label(data: DemonstrationData) -> None:
-    feasible, colliding = figures.demonstrations(data).axes
+    feasible, colliding = workspace.demonstrations(data).axes
     for axis, violates in ((feasible, False), (colliding, True)):
         x = data.x[data.violates == violates]
         assert axis.get_title().endswith(f": {len(x)} of {len(data.x)}")
@@ -92,7 +94,7 @@ def test_a_collision_is_marked_between_the_robots_that_collide() -> None:
 
 
 def test_the_sources_panel_shows_the_source_and_the_other_what_became_of_it(evaluation: Evaluation) -> None:
-    figure = figures.sources(model(), evaluation)
+    figure = workspace.sources(model(), evaluation)
     for axis, x in zip(figure.axes, (evaluation.source_samples, evaluation.samples["none"]), strict=True):
         shown = x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
         assert torch.equal(sort(lines(axis)), sort(shown))
@@ -101,7 +103,7 @@ def test_the_sources_panel_shows_the_source_and_the_other_what_became_of_it(eval
 
 def test_the_page_judges_each_setting_by_what_it_avoids(data: DemonstrationData, evaluation: Evaluation) -> None:
     flow = model()
-    axes = {axis.get_title().split("\n")[0]: axis for axis in figures.page(flow, data, evaluation, "test").axes}
+    axes = {axis.get_title().split("\n")[0]: axis for axis in workspace.page(flow, data, evaluation, "test").axes}
     for setting in ("none", "robot"):
         count = int((distance(evaluation.samples[setting]).amin(dim=1) < 0.3).sum())
         assert f"\n{count} of 512 " in axes[workspace.TITLES[setting]].get_title()
@@ -122,7 +124,7 @@ def test_the_page_shows_the_demonstrations_of_its_split_and_says_which(
     data: DemonstrationData, evaluation: Evaluation
 ) -> None:
     for split, name in config.SPLITS.items():
-        figure = figures.page(model(), data, evaluation, split)
+        figure = workspace.page(model(), data, evaluation, split)
         assert figure.get_suptitle() == f"cgp, seed 0, preset smoke, {name} split"
         assert figure.axes[0].get_title().startswith(f"{name} demonstrations\n")
         shown = data.held_out[split].x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
@@ -159,7 +161,7 @@ def test_what_counts_as_touching_is_drawn_where_samples_are_judged(
     flow, shown = model("sample.radius=0.2"), evaluation.samples["none"][: workspace.SHOWN]
     nearest = distance(shown).amin(dim=1)
     assert bool(((nearest > 0.2) & (nearest < 0.3)).any())
-    for axis in (workspace.distances(flow, evaluation).axes[0], figures.page(flow, data, evaluation, "test").axes[5]):
+    for axis in (workspace.distances(flow, evaluation).axes[0], workspace.page(flow, data, evaluation, "test").axes[5]):
         drawn = [line for line in axis.lines if line.get_linestyle() == "-"]
         found = torch.tensor(np.array([line.get_ydata() for line in drawn]))
         torch.testing.assert_close(sort(found), sort(distance(shown)), rtol=0, atol=1e-6)  # float32
@@ -290,9 +292,9 @@ def finished(place: Path, monkeypatch: pytest.MonkeyPatch, data: DemonstrationDa
     torch.save(checkpoint, tmp_path / "model.ckpt")
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "page.png").write_bytes(b"of training")
-    with tracking.start(flow.config, data) as logger:
+    with recording.start(experiment(flow.config, data)) as logger:
         logger.log_files(str(tmp_path))
-    return tracking.find_run(str(logger.run_id))
+    return store.find_run(str(logger.run_id))
 
 
 def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
@@ -310,7 +312,7 @@ def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
     pictures.add("taken_back")
     assert written.keys() == {f"{name}.png" for name in pictures} | {"animation.html"}
     assert all(written[f"{name}.png"].startswith(b"\x89PNG") for name in pictures)
-    logged = {file.name: file.read_bytes() for file in tracking.artifact(finished, "figures").iterdir()}
+    logged = {file.name: file.read_bytes() for file in store.artifact(finished, "figures").iterdir()}
     assert logged.pop("page.png") == b"of training"
     of_training = {"page.png", "demonstrations.png", "sources.png"}
     assert logged == {name: written[name] for name in written.keys() - of_training}
@@ -337,7 +339,7 @@ def test_the_pictures_of_the_test_split_take_no_place_of_the_others(
     assert all(torch.equal(x_1, cycle(data.test.x, 512)) for x_1 in asked)
     assert mine.read_text() == "of the validation split"
     drawn = {file.name for file in (mine.parent / "test").iterdir()}
-    assert {file.name for file in tracking.artifact(finished, "figures/test").iterdir()} == drawn
+    assert {file.name for file in store.artifact(finished, "figures/test").iterdir()} == drawn
     assert {"page.png", "animation.html"} <= drawn
     assert Path("runs/figures/test/methods.png").exists()
     assert "test split" in (mine.parent / "test" / "animation.html").read_text()
@@ -349,7 +351,7 @@ def test_several_runs_are_compared_and_a_name_cannot_lead_elsewhere(
     saved: list[Path] = []
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: saved.append(path))
     monkeypatch.setattr(gallery, "_log", lambda *_: None)
-    tracking.client().update_run(finished.info.run_id, name="../../elsewhere")
+    store.client().update_run(finished.info.run_id, name="../../elsewhere")
     gallery.draw([finished.info.run_id, "latest"], "val", Console(quiet=True))
     assert {path.parent for path in saved} == {Path("runs/figures/smoke_.._.._elsewhere"), Path("runs/figures")}
     assert [path.name for path in saved if path.parent.name == "figures"] == ["methods.png", "taken_back.png"]
@@ -359,8 +361,8 @@ def test_runs_of_one_name_are_told_apart_by_preset_and_by_what_was_changed(finis
     titles = []
     for key, value in {"": "", "preset": "quick", "ablation": "removed"}.items():
         if key:
-            tracking.client().set_tag(finished.info.run_id, key, value)
-        titles.append(gallery._title(tracking.client().get_run(finished.info.run_id)))
+            store.client().set_tag(finished.info.run_id, key, value)
+        titles.append(gallery._title(store.client().get_run(finished.info.run_id)))
     assert titles[0] == "smoke/cgp-s77"
     assert titles[1].startswith("quick/cgp-s77 data.num=500 ")
     assert titles[2] == "quick/cgp-s77"  # whose ablation's file is gone, so what was changed is not known

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from conflow.experiment import config, signals
-from conflow.experiment.grid import Cell, _listen, _train_all
+from conflow.grid.local import Cell, _listen, _train_all
+from conflow.tracking import signals
+from conflow.training import config
 from tests.conftest import raising_signals
 
 GRID = ["ablations", "preset=smoke", "seeds=0", "ablations=cgp fm"]

@@ -17,7 +17,7 @@ FILES = {
 
 
 def part(module: str) -> str:
-    """The wing or the file under conflow/ that a module belongs to; the package itself is ''."""
+    """The room or the file under conflow/ that a module belongs to; the package itself is ''."""
     return [*module.split("."), ""][1]
 
 
@@ -46,23 +46,31 @@ def loaded(*arguments: str) -> set[str]:
 
 @pytest.mark.parametrize("module", FILES)
 def test_imports_go_downwards_only(module: str) -> None:
-    """flow/ and scene/ know themselves alone, experiment/ those two, the planner all three, the bench everything."""
+    """A room knows itself and those below it; flow/ and scene/, at the bottom, and tracking/ know no other room."""
+    training = {"errors", "flow", "scene", "tracking", "training"}
+    results = {*training, "results"}
+    many = {*results, "grid", "figures"}
     below = {
+        "errors": set(),
         "flow": {"flow"},
         "scene": {"scene"},
-        "experiment": {"experiment", "flow", "scene"},
-        "planner": {"experiment", "flow", "scene"},
-        "bench": {"bench", "experiment", "flow", "scene", "planner"},
-        "__main__": {"experiment", "flow", "scene", "planner", "bench"},
+        "tracking": {"errors", "tracking"},
+        "training": training,
+        "results": results,
+        "figures": {*results, "figures"},
+        "grid": {*results, "grid"},
+        "commandline": training,
+        "planner": {*many, "commandline"},
+        "__main__": {*many, "commandline", "planner"},
     }
     ours = {part(name) for name in imports(module) if name.split(".")[0] == "conflow"} - {""}
     assert ours <= below.get(part(module), set())
 
 
-@pytest.mark.parametrize(("wing", "libraries"), [("flow", {"torch"}), ("scene", {"torch", "numpy"})])
-def test_the_method_and_the_world_stand_on_torch(wing: str, libraries: set[str]) -> None:
+@pytest.mark.parametrize(("room", "libraries"), [("flow", {"torch"}), ("scene", {"torch", "numpy"})])
+def test_the_method_and_the_world_stand_on_torch(room: str, libraries: set[str]) -> None:
     """Beside the standard library flow/ imports torch, and scene/, which reads files, NumPy too."""
-    modules = [module for module in FILES if part(module) == wing]
+    modules = [module for module in FILES if part(module) == room]
     assert len(modules) > 2
     imported = {name.split(".")[0] for module in modules for name in imports(module)}
     assert imported - sys.stdlib_module_names - {"conflow"} == libraries

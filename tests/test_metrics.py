@@ -7,8 +7,11 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from conflow.experiment import metrics as metrics_module
-from conflow.experiment.metrics import (
+from conflow.scene.constraint import Obstacle, ObstacleAvoidance, RobotAvoidance, Sum
+from conflow.scene.robots import PointRobots
+from conflow.scene.trajectories import swap
+from conflow.training import metrics as metrics_module
+from conflow.training.metrics import (
     CollisionRate,
     Diversity,
     EndpointError,
@@ -28,9 +31,6 @@ from conflow.experiment.metrics import (
     trajectory_metrics,
     wilson,
 )
-from conflow.scene.constraint import Obstacle, ObstacleAvoidance, RobotAvoidance, Sum
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
 
 ROBOTS = RobotAvoidance(PointRobots(2), 0.3)
 OBSTACLE = ObstacleAvoidance(PointRobots(2), [Obstacle(0.0, 0.5, 0.1)], 0.15)

@@ -3,17 +3,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from conflow.experiment import config
-from conflow.experiment.build import fitted, random_stream
-from conflow.experiment.config import Config
-from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.metrics import smoothness
-from conflow.experiment.module import SETTINGS, ConFlow, Setting, start_and_goal
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import guided_path, interpolate
 from conflow.flow.sampler import PIECE, integrate
 from conflow.flow.source import ENDPOINTS, fit_rbf
 from conflow.scene.trajectories import swap
+from conflow.training import config
+from conflow.training.build import fitted, random_stream
+from conflow.training.config import Config
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.metrics import smoothness
+from conflow.training.module import SETTINGS, ConFlow, Setting, start_and_goal
 
 
 def model(*arguments: str) -> ConFlow:

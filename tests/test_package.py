@@ -9,7 +9,8 @@ import pytest
 from mlflow import MlflowClient
 
 from conflow import __version__
-from conflow.experiment import config, tracking
+from conflow.tracking import recording
+from conflow.training import config
 
 ROOT = Path(__file__).parents[1]
 
@@ -44,7 +45,7 @@ def test_a_wheel_holds_all_that_is_read_at_run_time(installed: Path) -> None:
     """Every file of the package, and of conf/ inside the package: beside it another distribution's may be."""
     files = [path for part in ("conf", "conflow") for path in (ROOT / part).rglob("*") if path.is_file()]
     shipped = [path.relative_to(ROOT) for path in files if path.suffix != ".pyc"]
-    assert {Path("conf/base.yaml"), Path("conflow/experiment/figures/animation.html")} <= set(shipped)
+    assert {Path("conf/base.yaml"), Path("conflow/figures/animation.html")} <= set(shipped)
     for name in shipped:
         there = installed / ("conflow" if name.parts[0] == "conf" else "") / name
         assert there.read_bytes() == (ROOT / name).read_bytes()
@@ -53,7 +54,7 @@ def test_a_wheel_holds_all_that_is_read_at_run_time(installed: Path) -> None:
 
 def test_a_checkout_says_its_revision() -> None:
     head = execute("git", "rev-parse", "HEAD", cwd=ROOT).stdout.strip()
-    assert tracking.origin()["git_sha"] == (head or "unknown")
+    assert recording.origin()["git_sha"] == (head or "unknown")
 
 
 def test_an_installed_package_trains_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:

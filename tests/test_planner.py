@@ -14,15 +14,16 @@ import torch
 from torch import Tensor
 
 from conflow import __main__ as command_line
-from conflow.experiment import config, signals, tracking
-from conflow.experiment.build import fitted, random_stream
-from conflow.experiment.module import ConFlow
 from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
 from conflow.planner import PlanError, Planner, Plans, _ranked, exact
 from conflow.scene.constraint import Obstacle, RobotAvoidance
 from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import swap
+from conflow.tracking import signals, store
+from conflow.training import config
+from conflow.training.build import fitted, random_stream
+from conflow.training.module import ConFlow
 
 T, D = 32, 4
 START, GOAL = (-0.8, 0.0, 0.8, 0.0), (0.8, 0.0, -0.8, 0.0)
@@ -368,14 +369,14 @@ def test_a_run_is_found_by_whatever_names_it_or_by_a_file(tmp_path: Path, monkey
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.chdir(tmp_path)
     flow = planner()
-    store = tracking.client()
-    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    client = store.client()
+    experiment = client.get_experiment_by_name(store.EXPERIMENT)
     assert experiment is not None
-    ids = [store.create_run(experiment.experiment_id, run_name=name).info.run_id for name in ("empty-s0", "cgp-s0")]
-    store.log_artifact(ids[1], str(save(flow.model, tmp_path / "model.ckpt")))
+    ids = [client.create_run(experiment.experiment_id, run_name=name).info.run_id for name in ("empty-s0", "cgp-s0")]
+    client.log_artifact(ids[1], str(save(flow.model, tmp_path / "model.ckpt")))
     for run_id in ids:
-        store.set_terminated(run_id)
-    store.set_tag(ids[1], "preset", "long")
+        client.set_terminated(run_id)
+    client.set_tag(ids[1], "preset", "long")
     (tmp_path / "models").mkdir()
     save(flow.model, tmp_path / "models" / "mine")
     for wanted in ("cgp-s0", ids[1], "latest", "long/cgp-s0", "models/mine"):

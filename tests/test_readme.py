@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from conflow.bench import suite, table
-from conflow.experiment import compare, report
+from conflow.results import comparison, printing
+from tests.bench import suite, table
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path("runs/reference")
@@ -29,7 +29,7 @@ def test_every_titled_table_is_printed_by_make_compare_or_make_bench() -> None:
     """Printed by: make compare REFERENCE=1 FORMAT=markdown, make bench REFERENCE=1 FORMAT=markdown."""
     console = Console()
     with console.capture() as captured:
-        report.render(compare.collect_reference(), "markdown", console)
+        printing.render(comparison.collect_reference(), "markdown", console)
         table.render(suite.Bench.read(suite.REFERENCE), "markdown", console)
     printed = TITLED.findall(captured.get())
     shown = {page: TITLED.findall(page.read_text()) for page in PAGES}
@@ -43,7 +43,7 @@ def test_the_tables_of_record_are_what_make_compare_prints() -> None:
     """Written by: make compare REFERENCE=1 FORMAT=markdown > runs/reference/TABLES.md."""
     console = Console()
     with console.capture() as captured:
-        report.render(compare.collect_reference(), "markdown", console)
+        printing.render(comparison.collect_reference(), "markdown", console)
     assert (REFERENCE / "TABLES.md").read_text() == captured.get()
 
 

@@ -9,11 +9,13 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from conflow.experiment import code, compare, paper, record, report, tracking
-from conflow.experiment.cells import Cell
-from conflow.experiment.config import ConfigError, flatten, load
-from conflow.experiment.metrics import wilson
-from conflow.experiment.record import Record
+from conflow.errors import ConfigError
+from conflow.results import comparison, paper, printing, records
+from conflow.results.records import Record
+from conflow.results.tables import Cell
+from conflow.tracking import code, store
+from conflow.training.config import flatten, load
+from conflow.training.metrics import wilson
 
 
 def published(ablation: str, seed: int, count: int, *arguments: str, preset: str = "quick") -> Record:
@@ -24,7 +26,7 @@ def published(ablation: str, seed: int, count: int, *arguments: str, preset: str
         metrics |= {f"{group}/num": 1000, f"{group}/robot_collision_count": count, f"{group}/smoothness_median": 0.01}
     flat = {key: str(value) for key, value in flatten(settings.tree()).items()}
     made = Record(f"id-{seed}", ablation, preset, seed, flat, metrics, {"hardware": "a machine"}, 60.0)
-    made.write(record.FOLDER)
+    made.write(records.FOLDER)
     return made
 
 
@@ -35,14 +37,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def cell(found: compare.Comparison, table: str, row: str, column: str) -> Cell:
+def cell(found: comparison.Comparison, table: str, row: str, column: str) -> Cell:
     (one,) = [c for c in found.cells if (c.table, c.row, c.column) == (table, row, column)]
     return one
 
 
 def test_a_record_survives_its_file() -> None:
     made = published("cgp", 3, 20, "constraint.reduction=closest")
-    (path,) = record.FOLDER.iterdir()
+    (path,) = records.FOLDER.iterdir()
     assert path.name == "cgp-quick-constraint.reduction=closest-s3.json"
     assert Record.read(path) == made
 
@@ -59,7 +61,7 @@ def test_a_record_says_what_was_changed_and_nothing_else() -> None:
 
 def test_a_setting_that_came_later_counts_as_its_default() -> None:
     made = published("cgp", 0, 1)
-    path = next(record.FOLDER.iterdir())
+    path = next(records.FOLDER.iterdir())
     content = json.loads(path.read_text())
     del content["settings"]["correction.edges"]
     path.write_text(json.dumps(content))
@@ -70,7 +72,7 @@ def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
     for seed in range(3):
         published("cgp", seed, 300 + seed)
         published("cgp", seed, 200 + seed, "constraint.reduction=closest")
-    (found,) = compare.collect_reference()
+    (found,) = comparison.collect_reference()
     plain = cell(found, "1", "ConFlow (D+ and D-)", "none: robot")
     assert (plain.count, plain.trajectories, plain.seeds, plain.preset) == (903, 3000, 3, "quick")
     reading = "ConFlow (D+ and D-), constraint.reduction=closest"
@@ -88,7 +90,7 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
         published("cgp", seed, 300)
         published("gaussian", seed, 300)
         published("cgp", seed, 300, "data.amplitudes=[0.9,0.15]", "data.jitter=0.05")
-    (found,) = compare.collect_reference()
+    (found,) = comparison.collect_reference()
     assert {cell.row for cell in found.cells if cell.table != "2"} <= set(found.commands)
     assert {cell.column for cell in found.cells if cell.table == "2"} <= set(found.commands)
     train = 'make ablations ABLATIONS=cgp SEEDS="0 1" PRESET=quick'
@@ -100,7 +102,7 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
     assert other == f"{train} ARGS='data.amplitudes=[0.9,0.15] data.jitter=0.05'"
     console = Console(width=400)
     with console.capture() as captured:
-        report.render([found], "markdown", console)
+        printing.render([found], "markdown", console)
     lines = captured.get().splitlines()
     assert any(line.startswith("| default") and line.endswith(f"| `{train}` |") for line in lines)
     assert f"| again with | `{train.replace('cgp', 'gaussian')}` | `{train}` |" in lines
@@ -110,7 +112,7 @@ def test_a_narrow_terminal_cuts_no_command_short() -> None:
     published("no_negatives", 0, 300)
     console = Console(width=80)
     with console.capture() as captured:
-        report.render(compare.collect_reference(), "table", console)
+        printing.render(comparison.collect_reference(), "table", console)
     beside = "".join(line.rsplit("│", 2)[1].strip() for line in captured.get().splitlines() if line.endswith("│"))
     assert "ABLATIONS=no_negatives" in beside
 
@@ -122,7 +124,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     published("cgp", 0, 16, preset="long")
     published("fm", 0, 31)
     published("cgp", 0, 280, "train.batch_size=512", preset="paper")
-    long, quick, paper = compare.collect_reference()
+    long, quick, paper = comparison.collect_reference()
     assert (long.preset, quick.preset, paper.preset) == ("long", "quick", "paper")
     change = "ConFlow (D+ and D-), train.batch_size=512"
     assert [cell(found, "4", change, "none: robot").count for found in (paper, quick)] == [280, 290]
@@ -133,7 +135,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     assert "PRESET=paper ARGS='train.batch_size=512'" in paper.commands[change]
     console = Console(width=400)
     with console.capture() as captured:
-        report.render([long, quick, paper], "markdown", console)
+        printing.render([long, quick, paper], "markdown", console)
     text = captured.get()
     low, high = wilson(300, 1000)
     overview = text[text.index("**Robot collisions without guidance, at each preset, test split**") :].splitlines()
@@ -143,7 +145,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     assert overview[4].endswith(f"16 of 1000, 1 seed | {beside} |")
     assert overview[5].startswith("| FM (D+) | 0.031 |  | 0.0310, within this network [")
     with console.capture() as captured:
-        report.render([long, quick, paper], "json", console)
+        printing.render([long, quick, paper], "json", console)
     tree = json.loads(captured.get())
     assert [each["preset"] for each in tree["cells"]] == [c.preset for one in (long, quick, paper) for c in one.cells]
     assert tree["presets"]["quick"]["claims"][0]["verdict"] == "too few seeds"
@@ -161,7 +163,7 @@ def test_reasons_are_of_the_columns_that_differ() -> None:
         published("no_negatives", seed, 40 + seed)  # as the paper's 0.043 unguided
         published("fm_mixed", seed, 270 + seed)  # guided as the paper's 0.27
         published("fm", 0, 300)  # of one seed nothing is said
-    (found,) = compare.collect_reference()
+    (found,) = comparison.collect_reference()
     assert found.reasons == {
         "ConFlow (D+ and D-)": f"{paper.UNGUIDED['cgp']}; {paper.GUIDED}",
         "FM (D+ and D-)": paper.UNGUIDED["fm_mixed"],
@@ -173,14 +175,14 @@ def test_a_rate_is_compared_with_the_papers_as_one_more_network_of_256() -> None
         published("cgp", seed, 300 + seed)
         published("no_negatives", seed, 40)
     published("fm", 0, 300)
-    (found,) = compare.collect_reference()
+    (found,) = comparison.collect_reference()
     verdicts = {
         row: cell(found, "1", row, "none: robot").differs for row in ("ConFlow (D+ and D-)", "ConFlow (D+)", "FM (D+)")
     }
     assert verdicts == {"ConFlow (D+ and D-)": True, "ConFlow (D+)": False, "FM (D+)": None}
     console = Console()
     with console.capture() as captured:
-        report.render([found], "markdown", console)
+        printing.render([found], "markdown", console)
     for shown in ("paper 0.043, not distinguishable", "paper 0.016, differs", "paper 0.031, one seed: not judged"):
         assert shown in captured.get()
 
@@ -191,8 +193,8 @@ def test_a_mean_over_seeds_has_students_interval_and_its_networks_that_of_indepe
         made = published("cgp", seed, 300)
         names = ("test/none/smoothness_median", "test/none/energy_distance")
         ends = {f"{name}{end}": one for name in names for end, one in (("_low", low), ("", value), ("_high", high))}
-        replace(made, metrics=made.metrics | ends).write(record.FOLDER)
-    (found,) = compare.collect_reference()
+        replace(made, metrics=made.metrics | ends).write(records.FOLDER)
+    (found,) = comparison.collect_reference()
     one = cell(found, "3", "ConFlow (D+ and D-)", "smoothness, median")
     assert (one.within_low, one.within_high) == pytest.approx((0.011 - 0.005 / 2, 0.011 + 0.005 / 2))
     half = float(stats.t.isf(0.025, 1)) * 0.001
@@ -204,52 +206,52 @@ def test_a_mean_over_seeds_has_students_interval_and_its_networks_that_of_indepe
     assert (shared.low, shared.high) == pytest.approx((0.011 - reach, 0.011 + reach))
     # Where a seed has none, neither have its networks together.
     published("cgp", 1, 300)
-    (found,) = compare.collect_reference()
+    (found,) = comparison.collect_reference()
     assert cell(found, "3", "ConFlow (D+ and D-)", "smoothness, median").within_low is None
 
 
 def test_a_row_of_several_codes_says_so_and_one_of_none_does_not() -> None:
     made = [published("cgp", seed, 300) for seed in range(3)]
     changed = published("cgp", 0, 300, "train.batch_size=512")
-    assert [found.code for found in compare.collect_reference()] == [""]
+    assert [found.code for found in comparison.collect_reference()] == [""]
     for one, sha in zip((*made[1:], changed), ("a" * 16, "a" * 16, "b" * 16), strict=True):
-        replace(one, origin={"code_sha": sha}).write(record.FOLDER)
-    (found,) = compare.collect_reference()
+        replace(one, origin={"code_sha": sha}).write(records.FOLDER)
+    (found,) = comparison.collect_reference()
     assert found.code == f"Rows of runs by different code: cgp (s0: unknown; s1, s2: {'a' * 16})"
     console = Console(width=200)
     with console.capture() as captured:
-        report.render([found], "markdown", console)
+        printing.render([found], "markdown", console)
     assert found.code in captured.get().splitlines()
-    replace(made[0], origin={"code_sha": "a" * 16}).write(record.FOLDER)
-    assert [found.code for found in compare.collect_reference()] == [""]
+    replace(made[0], origin={"code_sha": "a" * 16}).write(records.FOLDER)
+    assert [found.code for found in comparison.collect_reference()] == [""]
 
 
 def test_no_records_and_broken_ones_are_named() -> None:
     with pytest.raises(ConfigError, match="expected records in"):
-        compare.collect_reference()
+        comparison.collect_reference()
     published("cgp", 0, 1)
-    (record.FOLDER / "broken.json").write_text("{")
+    (records.FOLDER / "broken.json").write_text("{")
     with pytest.raises(ConfigError, match=r"broken\.json: expected the record of a run"):
-        compare.collect_reference()
+        comparison.collect_reference()
 
 
 def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
-    store = tracking.client()
-    experiment = store.get_experiment_by_name("conflow")
+    client = store.client()
+    experiment = client.get_experiment_by_name("conflow")
     assert experiment is not None
     settings = load(["preset=smoke"])
     tags = {"ablation": "cgp", "preset": "smoke", "seed": "0", "config_sha": settings.sha(), "git_sha": "abc"}
     tags |= code.tags()
-    run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
+    run_id = client.create_run(experiment.experiment_id, tags=tags).info.run_id
     for key, value in flatten(settings.tree()).items():
-        store.log_param(run_id, key, str(value))
-    store.log_metric(run_id, "test/none/num", 10)
-    store.log_metric(run_id, "validation/none/num", 10)
-    store.log_metric(run_id, "test/obstacle/success_rate", 0.5)
-    store.log_metric(run_id, "val/none/robot_collision_rate", 0.2)
-    store.log_metric(run_id, "train/loss", 0.1)
-    store.set_terminated(run_id, "FINISHED")
-    (path,) = record.publish("smoke")
+        client.log_param(run_id, key, str(value))
+    client.log_metric(run_id, "test/none/num", 10)
+    client.log_metric(run_id, "validation/none/num", 10)
+    client.log_metric(run_id, "test/obstacle/success_rate", 0.5)
+    client.log_metric(run_id, "val/none/robot_collision_rate", 0.2)
+    client.log_metric(run_id, "train/loss", 0.1)
+    client.set_terminated(run_id, "FINISHED")
+    (path,) = records.publish("smoke")
     made = Record.read(path)
     expected = {"test/none/num": 10, "validation/none/num": 10, "test/obstacle/success_rate": 0.5}
     assert (made.run_id, made.metrics) == (run_id, expected)
@@ -259,17 +261,17 @@ def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
 
 def test_what_a_run_from_before_called_success_is_not_mixed_with_what_it_is_now(folder: Path) -> None:
     """Before runs were measured on the validation split, success ignored the obstacle."""
-    store = tracking.client()
-    experiment = store.get_experiment_by_name("conflow")
+    client = store.client()
+    experiment = client.get_experiment_by_name("conflow")
     assert experiment is not None
     tags = {"ablation": "cgp", "preset": "smoke", "seed": "0", "config_sha": load(["preset=smoke"]).sha()}
     for validated in (False, True):
-        run_id = store.create_run(experiment.experiment_id, tags=tags).info.run_id
-        store.log_metric(run_id, "test/none/success_low", 0.5)
+        run_id = client.create_run(experiment.experiment_id, tags=tags).info.run_id
+        client.log_metric(run_id, "test/none/success_low", 0.5)
         if validated:
-            store.log_metric(run_id, "validation/none/num", 10)
-        store.set_terminated(run_id, "FINISHED")
-        metrics = Record.of(store.get_run(run_id)).metrics
+            client.log_metric(run_id, "validation/none/num", 10)
+        client.set_terminated(run_id, "FINISHED")
+        metrics = Record.of(client.get_run(run_id)).metrics
         assert ("test/none/success_low" in metrics) == validated
         assert metrics.get("test/none/success_at_waypoints_low") == (None if validated else 0.5)
 
@@ -299,9 +301,9 @@ def test_a_method_on_other_demonstrations_has_a_table_of_its_own_with_their_d_pl
         published("plus", seed, 5)
         made = published("plus", seed, 7 + seed, "data.seed=101")
         feasible = {"without_model/feasible/num": 400, "without_model/feasible/near_count": 100}
-        replace(made, metrics=made.metrics | feasible | {"test/none/near_count": 200}).write(record.FOLDER)
+        replace(made, metrics=made.metrics | feasible | {"test/none/near_count": 200}).write(records.FOLDER)
     published("cgp", 0, 30, "constraint.reduction=closest")
-    (found,) = compare.collect_reference()
+    (found,) = comparison.collect_reference()
     row = "plus: the best together, data.seed=101"
     assert cell(found, "5", row, "none: robot").count == 15
     assert (cell(found, "5", row, "near rate").count, cell(found, "5", row, "near rate").trajectories) == (400, 2000)
@@ -316,8 +318,8 @@ def test_a_row_that_was_sampled_again_is_of_the_seeds_that_were() -> None:
     published("plus", 0, 5)
     made = published("plus", 1, 5)
     plain = {key: value for key, value in made.metrics.items() if not key.startswith("evaluate/")}
-    replace(made, metrics=plain).write(record.FOLDER)
-    (found,) = compare.collect_reference()
+    replace(made, metrics=plain).write(records.FOLDER)
+    (found,) = comparison.collect_reference()
     row = "plus: the best together, sample.solver:rk4"
     assert (cell(found, "4", row, "none: robot").seeds, cell(found, "4", row, "none: robot").count) == (1, 5)
     assert "for s in 0; do make evaluate" in found.commands[row]

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy import stats
 
-from conflow.experiment.metrics import EnergyDistance, wilson
-from conflow.experiment.seeds import LEVEL, Score, Seed, difference, differs, holm, mean_interval, rate_interval
+from conflow.results.statistics import LEVEL, Score, Seed, difference, differs, holm, mean_interval, rate_interval
+from conflow.training.metrics import EnergyDistance, wilson
 
 REPETITIONS = 2000
 NOISE = 3 * math.sqrt(0.95 * 0.05 / REPETITIONS)

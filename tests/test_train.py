@@ -6,13 +6,13 @@ import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from conflow.experiment import config
-from conflow.experiment.build import random_stream
-from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.finished import demonstrations, load_model
-from conflow.experiment.metrics import trajectory_metrics
-from conflow.experiment.module import SETTINGS
-from conflow.scene.trajectories import DemonstrationError
+from conflow.errors import ConfigError
+from conflow.training import config
+from conflow.training.build import random_stream
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.metrics import trajectory_metrics
+from conflow.training.module import SETTINGS
+from conflow.training.reload import demonstrations, load_model
 from tests.conftest import Command
 
 SETTINGS_ARGUMENTS = ["preset=smoke", "seed=3"]
@@ -186,5 +186,5 @@ def test_what_a_finished_run_cannot_be_asked_is_refused(
 def test_a_run_is_not_judged_on_data_that_have_changed_since(trained: tuple[Run, str]) -> None:
     run, _ = trained
     assert demonstrations(run, config.load(SETTINGS_ARGUMENTS)).digest == run.data.tags["data_digest"]
-    with pytest.raises(DemonstrationError, match="on which cgp-s3 was trained"):
+    with pytest.raises(ConfigError, match="on which cgp-s3 was trained"):
         demonstrations(run, config.load([*SETTINGS_ARGUMENTS, "data.seed=1"]))

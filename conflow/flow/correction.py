@@ -11,7 +11,7 @@ Edges = Literal["zero", "nearest", "normalised"]
 
 
 class Differentiable(Protocol):
-    """What this wing needs of a constraint."""
+    """What this room needs of a constraint."""
 
     def clearance(self, x: Tensor) -> Tensor:
         """c at every waypoint, (batch, T), of x (batch, T, D)."""

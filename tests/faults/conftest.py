@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from conflow import __main__ as command_line
-from conflow.experiment import config, signals, tracking
-from conflow.experiment.datamodule import DemonstrationData
-from conflow.experiment.finished import MODEL_FILE
-from conflow.experiment.module import ConFlow
+from conflow.tracking import signals, store
+from conflow.training import config
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.module import ConFlow
+from conflow.training.reload import MODEL_FILE
 
 RUN = "cgp-s0"
 
@@ -72,13 +73,13 @@ def finished_run(name: str, folder: Path) -> str:
     model = ConFlow(settings, data.T, data.D)
     described = {"config": settings.tree(), "T": data.T, "D": data.D, "threads": 1}
     torch.save({"conflow": described, "state_dict": model.state_dict()}, folder / MODEL_FILE)
-    store = tracking.client()
-    experiment = store.get_experiment_by_name(tracking.EXPERIMENT)
+    client = store.client()
+    experiment = client.get_experiment_by_name(store.EXPERIMENT)
     assert experiment is not None
     tags = {"ablation": "cgp", "preset": "smoke", "seed": "0", "config_sha": settings.sha(), "data_digest": data.digest}
-    run_id = str(store.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id)
-    store.log_artifact(run_id, str(folder / MODEL_FILE))
-    store.set_terminated(run_id)
+    run_id = str(client.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id)
+    client.log_artifact(run_id, str(folder / MODEL_FILE))
+    client.set_terminated(run_id)
     return run_id
 
 

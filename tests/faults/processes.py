@@ -15,10 +15,10 @@ import torch
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from conflow.experiment.signals import SIGNALS
+from conflow.tracking.signals import SIGNALS
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["conflow.experiment.train", "conflow.experiment.grid", "tests.faults.processes"])
+CONTEXT.set_forkserver_preload(["conflow.training.train", "conflow.grid.local", "tests.faults.processes"])
 
 Death = Callable[[], None]
 """Arranges, within the process, how it is going to die."""

@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 import torch
 
-from conflow.experiment import config
-from conflow.experiment.config import ConfigError
-from conflow.experiment.finished import MODEL_FILE
-from conflow.experiment.module import ConFlow
+from conflow.errors import ConfigError
 from conflow.planner import PlanError, Planner
 from conflow.scene.constraint import Obstacle
+from conflow.training import config
+from conflow.training.module import ConFlow
+from conflow.training.reload import MODEL_FILE
 from tests.faults.conftest import RUN, Run, assert_refused, listing
 
 HUGE = "1" + "0" * 400

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from conflow.experiment import checkpoints
-from conflow.experiment.checkpoints import AtomicCheckpointIO, CheckpointError
+from conflow.tracking import checkpoints
+from conflow.tracking.checkpoints import AtomicCheckpointIO, CheckpointError
 from tests.faults import processes
 from tests.faults.processes import history, runs, weights
 

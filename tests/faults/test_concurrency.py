@@ -80,21 +80,23 @@ def test_eight_trainings_started_at_once_on_no_store_all_finish(tmp_path: Path) 
 # A process that makes the experiment and adds new data sets to its run, each when it is told to.
 MAKE = """
 import sys
-from conflow.experiment import config, tracking
-from conflow.experiment.datamodule import DemonstrationData
+from conflow.tracking import recording
+from conflow.training import config
+from conflow.tracking import store
+from conflow.training.datamodule import DemonstrationData
 
 def wait():
     print("ready", flush=True)
     sys.stdin.readline()
 
-tracking.EXPERIMENT = sys.argv[1]
+store.EXPERIMENT = sys.argv[1]
 wait()
-store = tracking.client()
-run = store.create_run(store.get_experiment_by_name(tracking.EXPERIMENT).experiment_id)
+client = store.client()
+run = client.create_run(client.get_experiment_by_name(store.EXPERIMENT).experiment_id)
 for seed in range(5):
     data = DemonstrationData(config.load([*sys.argv[2:], f"data.seed={seed}"]))
     wait()
-    tracking._log_dataset(store, run.info.run_id, data)
+    recording._log_dataset(client, run.info.run_id, data)
 """
 
 

@@ -53,7 +53,7 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 def test_a_cell_that_died_as_it_was_begun_goes_on_as_the_same_run(tmp_path: Path) -> None:
     begun = ("train", "preset=smoke", "ablation=fm", "seed=0")
-    death = processes.killed_in("conflow.experiment.tracking", "_describe")
+    death = processes.killed_in("conflow.tracking.store", "_describe")
     assert processes.run(tmp_path, *begun, death=death)[0] == -signal.SIGKILL
     code, said = processes.run(tmp_path, "ablations", "preset=smoke", "seeds=0", "ablations=fm")
     assert code == 0, said

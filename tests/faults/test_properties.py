@@ -13,12 +13,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from conflow.experiment import config
-from conflow.experiment.config import Config, ConfigError, Range
+from conflow.errors import ConfigError
 from conflow.flow.source import Source, rbf
 from conflow.scene.constraint import Barrier, Obstacle, ObstacleAvoidance, RobotAvoidance
 from conflow.scene.robots import PointRobots
 from conflow.scene.trajectories import DemonstrationError, check, load, swap
+from conflow.training import config
+from conflow.training.config import Config, Range
 
 some = settings(derandomize=True, deadline=None, max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 many = settings(some, max_examples=80)

@@ -8,8 +8,8 @@ import pytest
 import torch
 from mlflow.entities import Run
 
-from conflow.experiment import alive
 from conflow.scene.trajectories import swap
+from conflow.tracking import liveness
 from tests.faults import processes
 from tests.faults.processes import Death, checkpoint_folder, history, killed_in, runs, store, weights
 
@@ -18,7 +18,7 @@ TRAIN = (
     *("train", "preset=smoke", "data.num=200", "train.max_steps=41", "train.val_every=10", "train.log_every=7"),
     *("train.batch_size=16", "sample.num=8", "sample.steps=3"),
 )
-STEP = ("conflow.experiment.module", "ConFlow.training_step")
+STEP = ("conflow.training.module", "ConFlow.training_step")
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +37,17 @@ def whole(folder: Path) -> Run:
 @pytest.mark.parametrize(
     "death",
     [
-        killed_in("conflow.experiment.tracking", "_describe"),
+        killed_in("conflow.tracking.recording", "_describe"),
         killed_in(*STEP, call=6),
         killed_in(*STEP, call=26),
         killed_in("torch.optim", "AdamW.step", call=37),
-        killed_in("conflow.experiment.module", "ConFlow.validation_step", call=2),
-        killed_in("conflow.experiment.module", "ConFlow.sample", call=3),
+        killed_in("conflow.training.module", "ConFlow.validation_step", call=2),
+        killed_in("conflow.training.module", "ConFlow.sample", call=3),
         killed_in("os", "fsync", call=5),
         killed_in("pathlib", "Path.replace", call=2),
         killed_in("pathlib", "Path.replace", call=5),
-        killed_in("conflow.experiment.train", "evaluate"),
-        killed_in("conflow.experiment.figures", "save"),
+        killed_in("conflow.training.train", "evaluate"),
+        killed_in("conflow.figures", "save"),
     ],
     ids=[
         "before it had a config",
@@ -79,7 +79,7 @@ def assert_ends_as(whole: Run, folder: Path, interrupted: Run) -> str:
     expected = weights(whole)
     assert all(torch.equal(tensor, expected[name]) for name, tensor in weights(resumed).items())
     assert history(folder, resumed) == history(folder, whole)
-    assert alive.NOTE not in resumed.data.tags
+    assert liveness.NOTE not in resumed.data.tags
     # What a finished run needs is among its artifacts.
     assert not checkpoint_folder(folder, resumed).exists()
     return output

@@ -19,9 +19,11 @@ import numpy as np
 import pytest
 import torch
 
-from conflow.experiment import config, tracking
-from conflow.experiment.config import CONF, ConfigError
-from conflow.experiment.finished import MODEL_FILE
+from conflow.errors import ConfigError
+from conflow.tracking import store
+from conflow.training import config
+from conflow.training.config import CONF
+from conflow.training.reload import MODEL_FILE
 from tests.faults.conftest import RUN, Run, assert_refused, listing
 
 PAIR = ("start=-0.8,0,0.8,0", "goal=0.8,0,-0.8,0")
@@ -141,9 +143,9 @@ def test_a_run_cannot_be_named_out_of_the_folder_of_pictures(
     folder.mkdir(parents=True)
     monkeypatch.chdir(folder)
     shutil.copytree(trained / "runs", "runs")
-    store = tracking.client()
-    run = tracking.find_run(RUN)
-    store.update_run(run.info.run_id, name="../../x")
+    client = store.client()
+    run = store.find_run(RUN)
+    client.update_run(run.info.run_id, name="../../x")
     before = set(listing(tmp_path))
     outcome = command("figures", "run=../../x")
     assert (outcome.code, outcome.err) == (0, "")

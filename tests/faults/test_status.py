@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from conflow.experiment import alive
+from conflow.tracking import liveness
 from tests.faults import processes
 from tests.faults.processes import killed_in, runs, store
 
@@ -65,9 +65,9 @@ def test_an_interrupted_run_is_killed_exits_with_the_signal_and_keeps_what_was_l
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        ("conflow.experiment.module", "ConFlow.training_step"),
-        ("conflow.experiment.tracking", "_describe"),
-        ("conflow.experiment.train", "evaluate"),
+        ("conflow.training.module", "ConFlow.training_step"),
+        ("conflow.tracking.recording", "_describe"),
+        ("conflow.training.train", "evaluate"),
     ],
 )
 def test_a_run_whose_process_is_gone_is_marked_by_the_next_command(module: str, name: str, folder: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_run_whose_process_is_gone_is_marked_by_the_next_command(module: str, 
     assert code == 2, output
     run = runs(folder)[0]
     assert run.info.status == "KILLED"
-    assert run.data.tags["mlflow.note.content"] == alive.GONE
+    assert run.data.tags["mlflow.note.content"] == liveness.GONE
     assert not list((folder / "runs" / "running").iterdir())
 
 
@@ -113,7 +113,7 @@ def test_a_run_that_is_alive_is_left_alone_and_cannot_be_gone_on_with(folder: Pa
 
 def test_of_two_that_go_on_with_the_same_run_one_is_refused(folder: Path) -> None:
     code, _ = processes.run(
-        folder, *ENDLESS, "seed=8", death=killed_in("conflow.experiment.module", "ConFlow.training_step", call=3)
+        folder, *ENDLESS, "seed=8", death=killed_in("conflow.training.module", "ConFlow.training_step", call=3)
     )
     assert code == -signal.SIGKILL
     both = [processes.start(folder, *ENDLESS, "seed=8", "resume=cgp-s8") for _ in range(2)]
@@ -129,7 +129,7 @@ def test_of_two_that_go_on_with_the_same_run_one_is_refused(folder: Path) -> Non
 
 def test_a_run_of_another_machine_is_nobodys_here_to_judge(folder: Path) -> None:
     code, _ = processes.run(
-        folder, *ENDLESS, "seed=9", death=killed_in("conflow.experiment.module", "ConFlow.training_step")
+        folder, *ENDLESS, "seed=9", death=killed_in("conflow.training.module", "ConFlow.training_step")
     )
     assert code == -signal.SIGKILL
     store(folder).set_tag(runs(folder)[0].info.run_id, "host", "elsewhere")
@@ -142,7 +142,7 @@ def test_a_dead_run_is_recognised_after_its_folder_has_moved(tmp_path: Path) -> 
     old = tmp_path / "old"
     old.mkdir()
     code, output = processes.run(
-        old, *ENDLESS, "seed=1", death=killed_in("conflow.experiment.module", "ConFlow.training_step")
+        old, *ENDLESS, "seed=1", death=killed_in("conflow.training.module", "ConFlow.training_step")
     )
     assert code == -signal.SIGKILL, output
     new = old.rename(tmp_path / "new")

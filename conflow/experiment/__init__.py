@@ -1,1 +1,0 @@
-"""Lightning and MLflow around the method: config, data, training, metrics, tracking, pictures."""

@@ -1,0 +1,523 @@
+"""Why the corrections work or do not: closed forms beside the numbers, from our own parts and without a run."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.console import Console
+from torch import Tensor
+
+from conflow.figures.curves import MARK, rate
+from conflow.figures.workspace import COLLISION, ROBOTS, save
+from conflow.flow.correction import Correction, covariant, gaussian_filter
+from conflow.flow.sampler import Field, states
+from conflow.flow.source import Source
+from conflow.results import paper
+from conflow.scene.constraint import Constraint
+from conflow.scene.trajectories import swap
+from conflow.tracking import store
+from conflow.training import config
+from conflow.training.build import build_source, fitted, random_stream, robot_avoidance
+from conflow.training.closed_form import Way, coordinates, expected, minimiser, posterior, whitened
+from conflow.training.config import Config
+
+# Okabe and Ito's palette.
+FILTER, COVARIANT, PEAK, PLAIN = "#E69F00", "#0072B2", "#009E73", "#CC79A7"
+FEASIBLE, SOURCE = ROBOTS[1], "#000000"
+PAIRS = 2000
+"""Demonstrations, each with its own x_0, over which expectations in the space of trajectories are taken."""
+GAPS, PARTICLES, GAP_STEPS = 500, 1000, 100
+FEW = 0.01
+LAMBDAS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0)
+TIMES = 25
+HORIZONS = (16, 24, 32, 48, 64, 96, 128)
+LENGTH_SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)
+CLEARED = 0.9
+SHAPES = 5
+SAMPLES, SAMPLE_STEPS = 512, 100
+WEIGHTS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0)
+PAPERS, PAPER_RATE = "filter, the paper's", paper.TABLE_1["cgp"][0]
+
+
+def draw(settings: Config, console: Console) -> None:
+    """Write all pictures under runs/figures/explain/ and print what each one finds."""
+    folder = store.RUNS / "figures" / "explain"
+    pictures: dict[str, Callable[[Config], Figure]] = {
+        "gap": gap,
+        "support": support,
+        "exact": exact,
+        "eigenvalues": eigenvalues,
+        "predicted_end": predicted_end,
+        "lambda_scale": lambda_scale,
+    }
+    for title, picture in pictures.items():
+        figure = picture(settings)
+        console.print(f"{title}.png: {' '.join(figure.get_suptitle().split())}", highlight=False, soft_wrap=True)
+        save({title: figure}, folder)
+    console.print(f"pictures are in {folder}", highlight=False)
+
+
+def gap(settings: Config) -> Figure:
+    """The gap between the robots when they pass, as a flow in one dimension, without and with the correction."""
+    problem, lambda_c = Gap.of(settings), settings.correction.lambda_c
+    paths = {weight: problem.paths(weight) for weight in sorted({*LAMBDAS, lambda_c})}
+    rates = {weight: problem.collision_rate(g[-1]) for weight, g in paths.items()}
+    figure = Figure(figsize=(9.5, 7.4), layout="constrained")
+    fields, (densities, curve) = figure.subplots(2, 2)
+    _fields(list(fields), problem, {weight: paths[weight] for weight in (0.0, lambda_c)})
+    enough = min((weight for weight, rate in rates.items() if rate < FEW), default=lambda_c)
+    _densities(densities, problem, {weight: paths[weight][-1] for weight in (0.0, enough, lambda_c)})
+    curve.axhline(problem.collision_rate(problem.g_1), color=COLLISION, ls="--", lw=1, label="demonstrations")
+    curve.plot(list(rates), list(rates.values()), color=COVARIANT, marker="o", ms=4, label="exact flow")
+    curve.set(xlabel=r"$\lambda$ (workspace units per t)", ylabel="share of gaps in collision, |g| < r")
+    curve.set_title("collisions after the flow")
+    curve.set_ylim(bottom=0)
+    _finish(curve)
+    figure.suptitle(
+        f"In one dimension the paper's correction works: {rates[0.0]:.1%} of gaps collide without it,\n"
+        f"{rates[enough]:.1%} from λ = {enough:g} on, and what it moved gathers outside"
+    )
+    return figure
+
+
+class Gap(NamedTuple):
+    """Flow matching of g = y1 - y2 at the middle waypoint, the signed gap with which the robots pass each other.
+
+    Attributes:
+        g_1: the demonstrations' gaps, (N,).
+        sd: standard deviation of the source's gap, which is Gaussian about 0.
+        u_c: the correction at one waypoint, without smoothing.
+        radius: the gap at which robots touch.
+    """
+
+    g_1: Tensor
+    sd: float
+    u_c: Correction
+    radius: float
+
+    @classmethod
+    def of(cls, settings: Config) -> "Gap":
+        """Some quantiles of the demonstrations' gaps, which stand for all, and the source's gap."""
+        x = demonstrations(settings)
+        middle = x.shape[1] // 2
+        g_1 = (x[:, middle, 1] - x[:, middle, 3]).quantile(_middles(GAPS))
+        # The difference of two independent robots.
+        variance = 2 * build_source(settings.source, x.shape[1]).covariance[middle, middle]
+        u_c = Correction(robot_avoidance(settings, x.shape[2]), torch.eye(1))
+        return cls(g_1, float(variance.sqrt()), u_c, settings.constraint.radius)
+
+    def field(self, weight: float) -> Field:
+        """E[x_1 - x_0 | x_t] + weight E[M | x_t] u^c(x_t) for gaps x (batch, 1, 1) and t (batch,), all alike."""
+        known = torch.stack([self.g_1, self.violates(self.g_1).float()], dim=1)
+
+        def v(x: Tensor, t: Tensor) -> Tensor:
+            g, now = x[:, :, 0], float(t[0])
+            end, M = (posterior(g / self.sd, self.g_1[:, None] / self.sd, now) @ known).split(1, dim=1)
+            # E[x_1 - x_0 | x_t] leads straight to E[x_1 | x_t].
+            return ((end - g) / (1 - now) + weight * M * self.push(g))[:, :, None]
+
+        return v
+
+    def paths(self, weight: float) -> Tensor:
+        """Where the field takes quantiles of the source, (GAP_STEPS + 1, PARTICLES)."""
+        g_0 = self.sd * torch.special.ndtri(_middles(PARTICLES))
+        return torch.stack([g[:, 0, 0] for g in states(self.field(weight), g_0[:, None, None], GAP_STEPS)])
+
+    def velocities(self, t: Tensor, g: Tensor, weight: float) -> Tensor:
+        """The field at times t (n,) and gaps g (m,), (m, n)."""
+        v = self.field(weight)
+        return torch.cat([v(g[:, None, None], one.expand(len(g)))[:, :, 0] for one in t], dim=1)
+
+    def push(self, g: Tensor) -> Tensor:
+        """What the correction adds to dg/dt at gaps g (batch, 1): both robots move."""
+        u_c = self.u_c(_beside(g[:, 0]))
+        return u_c[..., 1] - u_c[..., 3]
+
+    def violates(self, g: Tensor) -> Tensor:
+        """M of gaps g (batch,), boolean (batch,)."""
+        return self.u_c.constraint.clearance(_beside(g))[:, 0] < 0
+
+    def collision_rate(self, g: Tensor) -> float:
+        """The share of gaps g (batch,) in collision."""
+        return float(self.violates(g).float().mean())
+
+
+def support(settings: Config) -> Figure:
+    """The filtered and the covariant correction of D-, along s and in the source's own standard deviations."""
+    x = demonstrations(settings)
+    constraint, source = robot_avoidance(settings, x.shape[2]), build_source(settings.source, x.shape[1])
+    x = x[constraint.violation(x)].double()
+    # In float64 from end to end: in the trailing modes float32's rounding would be larger than what is to be seen.
+    g = constraint.gradient(x)
+    found = {"filter": _filter(settings, x.shape[1]) @ g, "covariant": covariant(source.covariance) @ g}
+    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    along, modes, norms = figure.subplots(1, 3)
+    middling = constraint.clearance(x).amin(dim=1).median(dim=0).indices
+    _along(along, {r"$\nabla C$": g[middling, :, 1]} | {name: u[middling, :, 1] for name, u in found.items()})
+    _by_mode(modes, {name: in_deviations(source, u)[..., 1].abs() for name, u in found.items()})
+    away = {name: in_deviations(source, u).square().sum(dim=(1, 2)).sqrt() for name, u in found.items()}
+    _norms(norms, away)
+    figure.suptitle(
+        f"After one unit of t at λ = 1 the filter's bump lies {away['filter'].median():.0f} standard "
+        f"deviations of the source away, the covariant one {away['covariant'].median():.2f}"
+    )
+    return figure
+
+
+def in_deviations(source: Source, u: Tensor) -> Tensor:
+    """e_k^T u / sqrt(lambda_k): shifts u (batch, T, D) in the source's standard deviations by mode, (batch, m, D)."""
+    return source.modes.mT @ u / source.variance.sqrt()[:, None]
+
+
+def exact(settings: Config) -> Figure:
+    """What the paper's loss asks for: collisions after the flow of its exact minimiser, and how far x_t goes astray."""
+    # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
+    nominal = replace(settings, data=replace(settings.data, jitter=0))
+    x_1, lambda_c = demonstrations(nominal)[:PAIRS], nominal.correction.lambda_c
+    source, constraint = build_source(nominal.source, x_1.shape[1]), robot_avoidance(nominal, x_1.shape[2])
+    nearest = replace(nominal, constraint=replace(nominal.constraint, reduction="closest"))
+    smoothing, M = _filter(nominal, x_1.shape[1]), constraint.violation(x_1)
+    corrections = {
+        PAPERS: Correction(constraint, smoothing),
+        "filter, closest approach alone": Correction(robot_avoidance(nearest, x_1.shape[2]), smoothing),
+        "covariant": Correction(constraint, covariant(source.covariance)),
+    }
+    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
+    rates, astray = figure.subplots(1, 2)
+    counts: dict[tuple[str, float], int] = {}
+    for (name, u_c), colour in zip(corrections.items(), (FILTER, PLAIN, COVARIANT), strict=True):
+        for weight in sorted({*WEIGHTS, lambda_c}):
+            path = sampled(source, x_1, minimiser(source, x_1, M, u_c, weight))
+            counts[name, weight] = int(constraint.violation(path[-1]).sum())
+            if weight == lambda_c:
+                t = torch.arange(len(path)) / SAMPLE_STEPS
+                astray.plot(t, torch.stack([_astray(source, x) for x in path]), color=colour, label=name)
+        own = {weight: count for (of, weight), count in counts.items() if of == name}
+        rate(rates, list(own), list(own.values()), SAMPLES, colour, name)
+    rates.axhline(float(M.float().mean()), color=COLLISION, ls="--", lw=1, label="demonstrations")
+    rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's reported rate")
+    rates.set(xlabel=r"weight $\lambda_c$", ylabel="robot-collision rate")
+    rates.set_ylim(top=1.6 * rates.get_ylim()[1])  # room for the legend
+    rates.set_title(f"{SAMPLES} samples of the exact flow\nband: 95 % Wilson")
+    astray.set(xlabel="flow time t", xlim=(0, 1), yscale="log", ylabel="root mean square, in standard deviations")
+    astray.set_title(rf"$x_t$ beyond the first {_kept()} modes, $\lambda_c = {lambda_c:g}$")
+    for axis in (rates, astray):
+        _finish(axis, fontsize="small")
+    figure.suptitle(
+        f"The exact minimiser of the paper's loss collides in {counts[PAPERS, lambda_c]} of {SAMPLES} samples at λ = "
+        f"{lambda_c:g}:\nit brings back what the filter pushes astray, which a network has to learn"
+    )
+    return figure
+
+
+def sampled(source: Source, x_1: Tensor, v: Field) -> list[Tensor]:
+    """The states of samples of the source, with the ends of demonstrations x_1, under a field."""
+    y = source.observe(x_1[:1]).expand(SAMPLES, -1, -1).double()
+    z = torch.randn(SAMPLES, source.modes.shape[1], y.shape[2], dtype=y.dtype, generator=random_stream("explain"))
+    return list(states(v, source.mean(y) + source.modes * source.variance.sqrt() @ z, SAMPLE_STEPS))
+
+
+def _astray(source: Source, x: Tensor) -> Tensor:
+    """The root mean square of x (batch, T, D) in the modes beyond those kept, in standard deviations."""
+    return whitened(source, x).unflatten(1, (-1, x.shape[2]))[:, _kept() :].square().mean().sqrt()
+
+
+def eigenvalues(settings: Config) -> Figure:
+    """How wide the source is in each of its modes, how wide the demonstrations are there, and the modes along s."""
+    x = demonstrations(settings)
+    x = x[~robot_avoidance(settings, x.shape[2]).violation(x)].double()
+    likely = fitted(replace(settings, source=replace(settings.source, fit=True)), x)
+    kept = _kept()
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    widths, shapes = figure.subplots(1, 2)
+    lengths, left_out = [], []
+    kernels = (settings.source, COVARIANT, "-", "the paper's"), (likely.source, FILTER, "--", "most likely for $D^+$")
+    for chosen, colour, style, name in kernels:
+        source = build_source(chosen, x.shape[1])
+        z = coordinates(source, x)
+        lengths.append(rf"$\ell = {chosen.length_scale:.2f}$")
+        left_out.append(float((source.modes[:, kept:] @ z[:, kept:]).abs().max()))
+        k, label = torch.arange(1, z.shape[1] + 1), f"source, {lengths[-1]}: {name}"
+        widths.plot(k, source.variance.sqrt(), color=colour, ls=style, marker="o", ms=4, label=label)
+        deviation = z.square().mean(dim=(0, 2)).sqrt()
+        widths.plot(k, deviation, color=colour, ls=":", marker="x", label=f"$D^+$ in its modes, {lengths[-1]}")
+        _shapes(shapes, source, style)
+    _widths(widths, settings.source.epsilon, kept)
+    shapes.set_title(f"first modes along s: solid {lengths[0]}, dashed {lengths[1]}")
+    figure.suptitle(
+        f"{kept} modes hold all of D+ to within {max(left_out):.0e} workspace units;\n"
+        "from there on the source is √ε wide and the demonstrations hold nothing more"
+    )
+    return figure
+
+
+def predicted_end(settings: Config) -> Figure:
+    """Who is in collision on the way, at x_t and at the end E[x_1 | x_t] that is expected from there."""
+    # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
+    # Modes beyond those kept are as wide as their white part, and would tell x_1 long before the others do.
+    nominal = replace(settings, data=replace(settings.data, jitter=0), source=replace(settings.source, modes=_kept()))
+    x = demonstrations(nominal)
+    constraint, source = robot_avoidance(nominal, x.shape[2]), build_source(nominal.source, x.shape[1])
+    violates = constraint.violation(x)
+    t = torch.arange(TIMES) / TIMES
+    feasible, every = ([expected(source, x_1[:PAIRS], now) for now in t.tolist()] for x_1 in (x[~violates], x))
+    figure = Figure(figsize=(12, 4.6), layout="constrained")
+    shares, pushes, told = figure.subplots(1, 3)
+    at, end = (
+        torch.stack([constraint.violation(one).float().mean() for one in ways])
+        for ways in ([way.x_t for way in feasible], [way.end for way in feasible])
+    )
+    shares.plot(t, at, color=FILTER, ls="--", label="at $x_t$")
+    shares.plot(t, end, color=COVARIANT, label=r"at the predicted end $E[x_1 | x_t]$")
+    shares.set(ylabel="share in collision", title="pairs with a feasible $x_1$, $D^+$", ylim=(0, 1.02))
+    u_c = Correction(constraint, covariant(source.covariance))
+    _pushes(pushes, t, feasible, x[~violates][:PAIRS], u_c)
+    _told(told, t, every, violates[:PAIRS], constraint)
+    for axis in (shares, pushes, told):
+        axis.set(xlabel="flow time t", xlim=(0, 1))
+        _finish(axis, fontsize="small")
+    best, even = int((at - end).argmax()), int((end < at).int().argmax())
+    figure.suptitle(
+        f"At t = {t[best]:.2f}, {at[best]:.0%} of feasible ways collide at x_t, {end[best]:.0%} at the predicted end;\n"
+        f"before t = {t[even]:.2f} more of the ends do, hence the weight t"
+    )
+    return figure
+
+
+def lambda_scale(settings: Config) -> Figure:
+    """The time in which a correction takes D- out of collision, by its scale, number of waypoints and length scale."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    ell = settings.source.length_scale
+    by_horizon = [clearing_times(settings, T, ell) for T in HORIZONS]
+    by_length = [clearing_times(settings, settings.data.horizon, length) for length in LENGTH_SCALES]
+    spans = {name: _span([times[name] for times in (*by_horizon, *by_length)]) for name in LOOKS}
+    for axis, at, times in zip(axes, (HORIZONS, LENGTH_SCALES), (by_horizon, by_length), strict=True):
+        _clearing(axis, at, times, spans)
+    axes[0].set(xlabel="waypoints T", title=rf"length scale $\ell = {ell:g}$")
+    axes[0].set_ylabel(rf"$\lambda t$ to clear {CLEARED:.0%} of $D^-$ (workspace units)")
+    axes[1].set(xlabel=r"length scale $\ell$ (of s)", title=f"T = {settings.data.horizon} waypoints")
+    _finish(axes[0], fontsize="small", title="largest / smallest of both panels", alignment="left")
+    figure.suptitle(
+        f"λ means the same within a factor of {spans[ROW_SUM]:.1f} with Σ scaled by its row sums, "
+        f"of {spans[PEAKED]:.1f} by its largest entry, of {spans[SIGMA]:.0f} as it is"
+    )
+    return figure
+
+
+ROW_SUM, PEAKED, SIGMA = r"$\Sigma$ / largest row sum (ours)", r"$\Sigma$ / largest entry", r"$\Sigma$"
+FILTERED = "Gaussian filter"
+LOOKS: dict[str, dict[str, Any]] = {
+    ROW_SUM: {"color": COVARIANT, "ls": "-", "marker": "o"},
+    PEAKED: {"color": PEAK, "ls": "--", "marker": "s"},
+    SIGMA: {"color": PLAIN, "ls": "-.", "marker": "^"},
+    FILTERED: {"color": FILTER, "ls": ":", "marker": "D"},
+}
+
+
+def clearing_times(settings: Config, T: int, length_scale: float) -> dict[str, float]:
+    """lambda t until x' = lambda S grad C(x) has taken most of D- out of collision, for the four matrices S of LOOKS.
+
+    By definition the time of a S is that of S divided by a, so that Sigma is followed once.
+    """
+    chosen = replace(settings, data=replace(settings.data, horizon=T, num=PAIRS // 2))
+    x = demonstrations(chosen)
+    constraint = robot_avoidance(chosen, x.shape[2])
+    x = x[constraint.violation(x)]
+    Sigma = build_source(replace(settings.source, length_scale=length_scale), T).covariance
+    row_sum = clearing_time(Correction(constraint, covariant(Sigma)), x)
+    sigma = row_sum / float(Sigma.abs().sum(dim=1).max())
+    smoothed = clearing_time(Correction(constraint, _filter(settings, T)), x)
+    return {ROW_SUM: row_sum, PEAKED: sigma * float(Sigma.max()), SIGMA: sigma, FILTERED: smoothed}
+
+
+def clearing_time(u_c: Correction, x: Tensor, h: float = 0.01) -> float:
+    """The time in which x' = u^c(x) takes CLEARED of the colliding x (batch, T, D) out of collision, to h."""
+    steps = 0
+    while (u_c.constraint.clearance(x).amin(dim=1) < 0).float().mean() > 1 - CLEARED:
+        x, steps = x + h * u_c(x), steps + 1
+    return steps * h
+
+
+def demonstrations(settings: Config) -> Tensor:
+    """The swaps that the settings describe, D+ and D-, (N, T, D)."""
+    data = settings.data
+    return swap(data.num, data.horizon, data.amplitudes, data.jitter, data.seed)
+
+
+def _beside(g: Tensor) -> Tensor:
+    """Two robots at one waypoint with y1 - y2 = g (batch,), as trajectories (batch, 1, 4)."""
+    zero = torch.zeros_like(g)
+    return torch.stack([zero, g / 2, zero, -g / 2], dim=1)[:, None]
+
+
+def _middles(count: int) -> Tensor:
+    """The middles of `count` equal parts of [0, 1]: levels of quantiles that stand for a law without chance."""
+    return (torch.arange(count) + 0.5) / count
+
+
+def _filter(settings: Config, T: int) -> Tensor:
+    return gaussian_filter(T, settings.correction.sigma, settings.correction.width)
+
+
+def _kept() -> int:
+    """The leading modes that the spectral network works in."""
+    modes = config.load(["ablation=spectral"]).source.modes
+    assert modes is not None
+    return modes
+
+
+def _fields(axes: Sequence[Axes], problem: Gap, paths: Mapping[float, Tensor]) -> None:
+    """The field over t and g in colour, a panel for each weight, with some paths through it."""
+    t, g = torch.linspace(0, 1, GAP_STEPS + 1), torch.linspace(-2, 2, 201)
+    v = {weight: problem.velocities(t[:-1], g, weight) for weight in paths}
+    # Outside the demonstrations the field grows like 1 / (1 - t) and would leave no colour for the rest.
+    limit = max(float(one[g.abs() < 1].abs().max()) for one in v.values())
+    for axis, (weight, path) in zip(axes, paths.items(), strict=True):
+        grid = t[:-1].numpy(), g.numpy(), v[weight].numpy()
+        image = axis.pcolormesh(*grid, cmap="PuOr", vmin=-limit, vmax=limit, shading="nearest")
+        axis.plot(t, path[:, PARTICLES // 80 :: PARTICLES // 40], color="black", lw=0.6)
+        for side in (-problem.radius, problem.radius):
+            axis.axhline(side, color=COLLISION, ls="--", lw=1.2)
+        axis.set(xlabel="flow time t", ylabel="signed gap g (workspace units)", xlim=(0, 1), ylim=(-2, 2))
+        axis.set_title(rf"exact field and paths, $\lambda = {weight:g}$")
+    axes[0].figure.colorbar(image, ax=axes, label="dg/dt (workspace units per t)", extend="both")
+
+
+def _densities(axis: Axes, problem: Gap, ends: Mapping[float, Tensor]) -> None:
+    """The gaps of demonstrations and of where the flow ends, and the density of the source."""
+    bins = torch.linspace(-2, 2, 81).tolist()
+    share = torch.full_like(problem.g_1, 1 / (len(problem.g_1) * (bins[1] - bins[0])))
+    inside = problem.violates(problem.g_1)
+    for chosen, colour, name in ((~inside, FEASIBLE, "$D^+$"), (inside, COLLISION, "$D^-$")):
+        axis.hist(problem.g_1[chosen], bins=bins, weights=share[chosen], color=colour, alpha=0.5, label=name)
+    for (weight, g), colour in zip(ends.items(), (PLAIN, ROBOTS[3], COVARIANT), strict=False):
+        label = rf"flow, $\lambda = {weight:g}$"
+        axis.hist(g, bins=bins, density=True, histtype="step", color=colour, lw=1.4, label=label)
+    normal = torch.distributions.Normal(0.0, problem.sd)
+    axis.plot(bins, normal.log_prob(torch.tensor(bins)).exp(), color=SOURCE, ls=":", label="source")
+    axis.set(xlabel="signed gap g (workspace units)", ylabel="density (1 / workspace unit)", xlim=(-2, 2))
+    axis.set_title("where the flow ends")
+    axis.set_ylim(top=1.4 * axis.get_ylim()[1])
+    _finish(axis, ncols=2, loc="upper center", fontsize="small")
+
+
+def _along(axis: Axes, shifts: Mapping[str, Tensor]) -> None:
+    """One demonstration's gradient and corrections (T,) along s."""
+    for (name, u), colour in zip(shifts.items(), (MARK, FILTER, COVARIANT), strict=True):
+        axis.plot(torch.linspace(0, 1, len(u)), u, color=colour, marker=".", label=name)
+    axis.set(xlabel="s (trajectory time)", ylabel=r"robot 1 in y at $\lambda = 1$ (workspace units per t)")
+    axis.set_title("one colliding demonstration")
+    _finish(axis)
+
+
+def _by_mode(axis: Axes, values: Mapping[str, Tensor]) -> None:
+    """Median over the batch and a band of the middle 90 % of values (batch, m), by mode."""
+    for (name, z), colour in zip(values.items(), (FILTER, COVARIANT), strict=True):
+        k = torch.arange(1, z.shape[1] + 1)
+        low, median, high = z.quantile(torch.tensor([0.05, 0.5, 0.95], dtype=z.dtype), dim=0)
+        axis.fill_between(k, low, high, color=colour, alpha=0.25, lw=0)
+        axis.plot(k, median, color=colour, marker="o", ms=4, label=name)
+    axis.axhline(1, color=MARK, lw=0.8)
+    axis.set(yscale="log", xlabel="mode k", ylabel=r"$|e_k^\top u^c|\ /\ \sigma_k$ (standard deviations)")
+    axis.set_title("robot 1 in y by mode of the source\nmedian and 5 to 95 % of $D^-$")
+    _finish(axis)
+
+
+def _norms(axis: Axes, values: Mapping[str, Tensor]) -> None:
+    """How far off shifts (batch,) are in all modes and dimensions."""
+    bins = torch.logspace(-2, 3, 61).tolist()
+    for (name, norm), colour in zip(values.items(), (FILTER, COVARIANT), strict=True):
+        axis.hist(norm, bins=bins, color=colour, alpha=0.7, label=f"{name}, median {norm.median():.3g}")
+    axis.set(xscale="log", xlabel="Cameron-Martin norm (standard deviations)", ylabel="demonstrations")
+    axis.set_title(f"all modes and dimensions\n{len(norm)} demonstrations of $D^-$")
+    _finish(axis)
+
+
+def _widths(axis: Axes, epsilon: float, kept: int) -> None:
+    """Label the widths by mode, with the kernel's white part and the modes that are kept."""
+    floor = epsilon**0.5
+    axis.axhline(floor, color=MARK, lw=0.8)
+    axis.annotate(r"$\sqrt{\epsilon}$: the kernel's white part", (kept + 2, floor), (0, 4), "data", "offset points")
+    axis.axvline(kept + 0.5, color=MARK, ls="--", lw=1)
+    where = "data", "axes fraction"
+    axis.annotate(f"{kept} modes kept", (kept + 0.5, 0.03), (-3, 0), where, "offset points", ha="right", color=MARK)
+    axis.set(yscale="log", xlabel="mode k", ylabel=r"$\sigma_k$, root mean square of $D^+$ (workspace units)")
+    # What lies below is the rounding of the demonstrations to float32.
+    axis.set_ylim(bottom=1e-4 * floor)
+    axis.set_title("width by mode")
+    _finish(axis, fontsize="small")
+
+
+def _shapes(axis: Axes, source: Source, style: str) -> None:
+    """The first eigenvectors along s, their arbitrary signs chosen so that they begin upwards."""
+    E = source.modes * source.modes[1].sign()
+    for j in range(SHAPES):
+        label = f"k = {j + 1}" if style == "-" else None
+        colour = colormaps["viridis"](0.9 * j / (SHAPES - 1))
+        axis.plot(torch.linspace(0, 1, len(E)), E[:, j], color=colour, ls=style, label=label)
+    axis.set(xlabel="s (trajectory time)", ylabel="eigenvector $e_k$ (of length 1)")
+    axis.set_ylim(top=1.3 * float(E[:, :SHAPES].max()))
+    _finish(axis, ncols=SHAPES, loc="upper center", fontsize="small", columnspacing=1, handlelength=1)
+
+
+def _pushes(axis: Axes, t: Tensor, ways: Sequence[Way], x_1: Tensor, u_c: Correction) -> None:
+    """The push on pairs that need none, at both places, without and with the weight t, and its integral over t."""
+    at = torch.stack([_size(u_c(way.x_t)) for way in ways])
+    end = torch.stack([_size(u_c(way.end)) for way in ways])
+    for push, colour, name in ((at, FILTER, "at $x_t$"), (end, COVARIANT, "at the end")):
+        for weight, style, weighted in ((torch.ones_like(t), ":", ""), (t, "-", ", times t")):
+            label = rf"{name}{weighted}: $\int dt$ = {float((weight * push).mean()):.3f}"
+            axis.plot(t, weight * push, color=colour, ls=style, label=label)
+    axis.axhline(float(_size(u_c(x_1))), color=MARK, lw=0.8, ls="--", label="at $x_1$: the softplus's tail")
+    axis.set(ylabel=r"mean $\max_s |u^c|$ at $\lambda = 1$ (workspace units per t)")
+    axis.set_title("push on the same pairs, which need none")
+    axis.set_ylim(0, 1.7 * float(end.max()))  # room for the legend
+
+
+def _size(u: Tensor) -> Tensor:
+    """The largest coordinate of shifts u (batch, T, D) along the trajectory, mean over the batch."""
+    return u.abs().amax(dim=(1, 2)).mean()
+
+
+def _told(axis: Axes, t: Tensor, ways: Sequence[Way], violates: Tensor, constraint: Constraint) -> None:
+    """How well three signs tell pairs with a colliding x_1 from the others: share among those minus among these."""
+    M = violates.float()
+    signs = {
+        "$x_t$ collides": [constraint.violation(way.x_t) for way in ways],
+        "the predicted end collides": [constraint.violation(way.end) for way in ways],
+        # Bayes's rule: no other sign that is a function of x_t has a larger difference.
+        r"$E[M | x_t] > E[M]$, the paper's mask: best": [way.weights @ M > M.mean() for way in ways],
+    }
+    looks = ((FILTER, "--"), (COVARIANT, "-"), (MARK, "-."))
+    for (name, found), (colour, style) in zip(signs.items(), looks, strict=True):
+        difference = [float(sign[violates].float().mean() - sign[~violates].float().mean()) for sign in found]
+        axis.plot(t, difference, color=colour, ls=style, label=name)
+    axis.set(ylabel="share among $D^-$ minus share among $D^+$", title="all pairs: signs that $x_1$ collides")
+    axis.set_ylim(top=1.4)  # room for the legend
+    axis.set_yticks([0, 0.5, 1])
+
+
+def _clearing(
+    axis: Axes, at: Sequence[float], times: Sequence[Mapping[str, float]], spans: Mapping[str, float]
+) -> None:
+    """A line for each matrix S over the number of waypoints or the length scale."""
+    for name, look in LOOKS.items():
+        axis.plot(at, [one[name] for one in times], ms=4, label=f"{name}: {spans[name]:.3g}", **look)
+    axis.set(xscale="log", yscale="log")
+    axis.set_xticks(at, [f"{x:g}" for x in at])
+    axis.set_xticks([], minor=True)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _span(values: Sequence[float]) -> float:
+    return max(values) / min(values)
+
+
+def _finish(axis: Axes, **legend: Any) -> None:
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(frameon=False, **legend)

@@ -1,0 +1,183 @@
+"""Every ablation for every seed: which cells are finished, which are to do, and a process for each that is."""
+
+import contextlib
+import math
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from rich.console import Console
+
+from conflow.scene.trajectories import DemonstrationError
+from conflow.tracking import code, resume, signals, store
+from conflow.training import config
+from conflow.training.config import Config
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.progress import ProgressDisplay
+
+STEPS = re.compile(r"^(training|sampling test|sampling validation) (\d+)/(\d+)")
+STAGES = {"training": (0.0, 0.9), "sampling test": (0.9, 0.05), "sampling validation": (0.95, 0.05)}
+"""What comes before each stage of a cell, and what it adds, as shares of the whole."""
+
+
+@dataclass
+class Cell:
+    """One experiment of the grid: the arguments that ask for it, how far it is, and whether it failed to end well.
+
+    Attributes:
+        again: why it is trained although it was before.
+    """
+
+    arguments: list[str]
+    config: Config
+    share: float = 0.0
+    note: str = ""
+    again: str = ""
+    failed: bool = True
+    output: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        return f"{self.config.ablation}-s{self.config.seed}"
+
+
+def run(
+    ablations: Sequence[str],
+    seeds: Sequence[str],
+    arguments: Sequence[str],
+    jobs: int,
+    console: Console,
+    any_code: bool = False,
+) -> int:
+    """Train the cells that are not finished yet, `jobs` at a time; the number of cells that failed.
+
+    A cell is finished when MLflow has a FINISHED run of the same config on the same data by the same code, so a grid
+    that was stopped goes on where it stopped. Each cell is a process of its own: one that fails leaves the others
+    alone.
+
+    Args:
+        ablations: by name.
+        seeds: each for every ablation.
+        arguments: further settings of all cells.
+        jobs: how many are trained at once.
+        console: for progress.
+        any_code: take runs of other code as well.
+
+    Raises:
+        ConfigError: any of the cells cannot be asked for; then none is started.
+    """
+    cells = [
+        Cell(chosen, config.load(chosen))
+        for seed in seeds
+        for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
+    ]
+    todo = [cell for cell in cells if not _finished(cell, any_code)]
+    console.print(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before", highlight=False)
+    for cell in todo:
+        if cell.again:
+            console.print(f"{cell.name}: {cell.again}", highlight=False, soft_wrap=True)
+    if todo:
+        _train_all(todo, jobs, console)
+    for cell in todo:
+        if cell.failed:
+            console.print(
+                f"{cell.name} failed: {cell.output[-1] if cell.output else 'no output'}",
+                highlight=False,
+                soft_wrap=True,
+            )
+    return sum(cell.failed for cell in todo)
+
+
+def _finished(cell: Cell, any_code: bool) -> bool:
+    """Whether a cell is; if it was interrupted, it is told to go on from there, and if by other code, why it is not."""
+    try:
+        digest = DemonstrationData(cell.config).digest
+    except DemonstrationError:
+        return False  # the cell itself will say so, and the others go on
+    runs = store.runs(config_sha=cell.config.sha(), data_digest=digest)
+    ended = [run for run in runs if run.info.status in ("FINISHED", *resume.INTERRUPTED)]
+    ours = [run for run in ended if any_code or not code.differing(run.data.tags)]
+    if any(run.info.status == "FINISHED" for run in ours):
+        return True
+    if ours:
+        cell.arguments += [f"resume={ours[0].info.run_id}", *(["code=any"] if any_code else [])]
+    elif ended:
+        cell.again = f"trained by other code: {', '.join(code.differing(ended[0].data.tags))}"
+    return False
+
+
+def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
+    waiting: queue.SimpleQueue[Cell] = queue.SimpleQueue()
+    for cell in cells:
+        waiting.put(cell)
+    processes: set[subprocess.Popen[str]] = set()
+    threads = [threading.Thread(target=_work, args=(waiting, processes, jobs), daemon=True) for _ in range(jobs)]
+    with ProgressDisplay(console) as display:
+        task = display.add("cells", len(cells))
+        for thread in threads:
+            thread.start()
+        try:
+            while any(thread.is_alive() for thread in threads):
+                time.sleep(0.5)
+                busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
+                display.update(task, math.floor(10 * sum(cell.share for cell in cells)) / 10, busy)
+        except BaseException:
+            with signals.held():
+                _stop(waiting, processes, threads)
+            raise
+
+
+def _stop(
+    waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], threads: Sequence[threading.Thread]
+) -> None:
+    """Begin no other cell, and end those that train: each marks its own run KILLED."""
+    with contextlib.suppress(queue.Empty):
+        while True:
+            waiting.get_nowait()
+    told: set[subprocess.Popen[str]] = set()
+    while any(thread.is_alive() for thread in threads):
+        for process in set(processes) - told:  # also one that was only being started
+            process.terminate()
+            told.add(process)
+        time.sleep(0.1)
+
+
+def _work(waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], jobs: int) -> None:
+    """Train one waiting cell after the other."""
+    while True:
+        try:
+            cell = waiting.get_nowait()
+        except queue.Empty:
+            return
+        process = subprocess.Popen(
+            [sys.executable, "-m", "conflow", "train", *cell.arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            # Processes that share the cores would otherwise each start a thread for every core and crawl.
+            env={"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // jobs)), **os.environ},
+            start_new_session=True,  # Ctrl-C reaches the grid alone, which then ends its cells in order
+        )
+        processes.add(process)
+        assert process.stdout is not None
+        for line in process.stdout:
+            _listen(cell, line.strip())
+        cell.failed = process.wait() != 0
+        processes.discard(process)
+        cell.share, cell.note = 1.0, ""
+
+
+def _listen(cell: Cell, line: str) -> None:
+    """Take a cell's progress from a line that it printed."""
+    if line:
+        cell.output.append(line)
+    if found := STEPS.match(line):
+        before, share = STAGES[found[1]]
+        cell.share = before + share * int(found[2]) / int(found[3])
+        cell.note = f"{found[1]} {found[2]}/{found[3]}"

@@ -1,0 +1,97 @@
+"""The paper's claims, and ours, in words: what the runs say to each."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from conflow.results import statistics
+from conflow.results.records import Record
+from conflow.results.statistics import LEVEL, Difference
+from conflow.results.tables import COLLISIONS, QUALITIES, cell, scores
+from conflow.training.summary import digits
+
+Verdict = Literal["holds", "reversed", "not distinguishable", "too few seeds", "no runs"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence "a is lower than b", and what the runs say to it.
+
+    Attributes:
+        verdict: by the corrected p.
+        p: of the t test between seeds, in pairs where two seeds or more are common; none where it cannot be made.
+        corrected_p: by Holm's correction for all claims that are printed together.
+        unseen: where not distinguishable, the least difference that would have been seen, at the spread of these
+            seeds and with that correction.
+    """
+
+    text: str
+    verdict: Verdict
+    p: float | None
+    corrected_p: float | None
+    unseen: float | None
+    detail: str
+
+
+def claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
+    """Each as "a is lower than b"; none where there are no runs at all."""
+    if not runs:
+        return []
+    none, *_ = COLLISIONS
+    rates = [
+        ("ConFlow collides less than FM, without guidance", "cgp", "fm", none),
+        *(
+            (f"negatives help ConFlow ({column})", "cgp", "no_negatives", metric)
+            for metric, column in list(COLLISIONS.items())[:4]
+        ),
+        ("naive negatives hurt FM, without guidance", "fm", "fm_mixed", none),
+        ("CGP beats Gaussian: collision rate", "cgp", "gaussian", none),
+    ]
+    others = [(metric, row) for metric, row in QUALITIES.items() if metric != none]
+    ours = [
+        ("the spectral network lets ConFlow collide less, without guidance", "spectral", "cgp", none),
+        ("plus collides less than ConFlow, without guidance", "plus", "cgp", none),
+        ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
+    ]
+    ordered = [*rates, *((f"CGP beats Gaussian: {row}", "cgp", "gaussian", key) for key, row in others), *ours]
+    return _judged([_compared(runs, *claim) for claim in ordered])
+
+
+def _compared(
+    runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str
+) -> tuple[Claim, Difference | None, bool]:
+    """A claim as it is before the test, the difference that decides it, if any, and whether that is of rates."""
+    if lower not in runs or higher not in runs:
+        missing = " and ".join(name for name in (lower, higher) if name not in runs)
+        return _undecided(text, "no runs", f"no finished run of {missing}"), None, False
+    a, b = (cell("", "", "", None, metric, runs[name]) for name in (lower, higher))
+    if a is None or b is None:
+        reason = f"not all runs of {lower} and {higher} have {metric.removeprefix('test/')}"
+        return _undecided(text, "no runs", reason), None, False
+    between = statistics.difference(scores(metric, runs[lower]), scores(metric, runs[higher]))
+    detail = f"{digits(a.value)} against {digits(b.value)}, {a.seeds} and {b.seeds} seeds"
+    if between is not None and between.pairs:
+        detail += f", {between.pairs} in pairs"
+    return _undecided(text, "too few seeds", detail), between, a.count is not None
+
+
+def _undecided(text: str, verdict: Verdict, detail: str) -> Claim:
+    return Claim(text, verdict, None, None, None, detail)
+
+
+def _judged(compared: Sequence[tuple[Claim, Difference | None, bool]]) -> list[Claim]:
+    """The claims with their verdicts, corrected for all that are tested."""
+    tested = [i for i, (_, between, _) in enumerate(compared) if between is not None]
+    ps = [between.p for _, between, _ in compared if between is not None]
+    corrected = statistics.holm(ps)
+    # What Holm asks of the smallest p that it does not reject, and so of all that are not.
+    level = LEVEL / max(1, sum(p >= LEVEL for p in corrected))
+    judged = [claim for claim, _, _ in compared]
+    for i, p, corrected_p in zip(tested, ps, corrected, strict=True):
+        claim, between, of_rates = compared[i]
+        assert between is not None
+        seen = corrected_p < LEVEL
+        verdict: Verdict = "not distinguishable" if not seen else "holds" if between.a < between.b else "reversed"
+        unseen = None if seen else between.visible_rate(level) if of_rates else between.visible(level)
+        judged[i] = replace(claim, verdict=verdict, p=p, corrected_p=corrected_p, unseen=unseen)
+    return judged

@@ -1,0 +1,191 @@
+"""The paper's tables and claims and tables of our own, filled from finished runs or from the records of them alone."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from conflow.errors import ConfigError
+from conflow.results import paper, records
+from conflow.results.claims import Claim, claims
+from conflow.results.records import Record
+from conflow.results.tables import BASELINE, COLLISIONS, METHODS, Cell, labelled, labels, tables
+from conflow.tracking import code
+from conflow.training import config
+from conflow.training.config import SPLITS, SplitName
+from conflow.training.evaluation import UNCHANGED
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The cells of all tables at one preset, the claims, which runs they come from, and how to make a row again.
+
+    Attributes:
+        commands: what makes a row again, by its name.
+        reading: how the paper was read, in settings; rows that were read otherwise say so.
+        reasons: why rows differ from the paper's, for those that do.
+        code: which runs are of other code than the present or, of published ones, than the others of their row.
+        split: whose starts and goals the models were given; rows without a model are always of the test split.
+        left_out: the names of finished runs that were not measured on it.
+    """
+
+    preset: str
+    cells: list[Cell]
+    claims: list[Claim]
+    runs: dict[str, list[str]]
+    commands: dict[str, str]
+    reading: str
+    reasons: dict[str, str]
+    code: str
+    split: SplitName
+    left_out: list[str]
+
+
+def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val") -> Comparison:
+    """Compare the newest finished run of every ablation and seed at a preset, with arguments as they were trained.
+
+    Where runs of the present code have finished, the newest of these.
+
+    Raises:
+        ConfigError: there is no such run, or none was measured on this split.
+    """
+    found = records.from_store(preset, arguments)
+    if not found:
+        raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
+    measured = [one.on(split) for one in found if one.measured(split)]
+    if not measured:
+        raise ConfigError(
+            f"preset={preset}: no finished run was measured on the {SPLITS[split]} split, as those from before it was "
+            f"part of a run were not; try: split=test"
+        )
+    left_out = [f"{one.ablation}-s{one.seed}" for one in found if not one.measured(split)]
+    rows = _grouped(measured, lambda one: one.ablation)
+    of_code = _of_other_code(one for of_row in rows.values() for one in of_row)
+    return _comparison(preset, rows, {}, of_code, split, left_out)
+
+
+def collect_reference() -> list[Comparison]:
+    """Compare the records under runs/reference/ on test, preset by preset from the one of the most training down.
+
+    A preset that has changed runs alone, with nothing to compare them with, comes last.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    published = [one.on("test") for one in records.from_files()]
+    found = []
+    for preset in sorted({one.preset for one in published}, key=_scale, reverse=True):
+        plain = [one for one in published if one.preset == preset and not one.changes]
+        changed = [one for one in published if one.preset == preset and one.changes]
+        runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
+        found.append(_comparison(preset, runs, readings, _of_different_code(runs | readings), "test", []))
+    return sorted(found, key=lambda one: not one.claims)
+
+
+def _scale(preset: str) -> int:
+    """How much is computed in a training at a preset, about."""
+    settings = config.load([f"preset={preset}"])
+    return settings.train.max_steps * settings.train.batch_size * settings.network.hidden**2
+
+
+def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[str, list[Record]]:
+    """Records by name, those of METHODS first and in their order."""
+    rank = {ablation: i for i, ablation in enumerate(METHODS)}
+    groups: dict[str, list[Record]] = {}
+    for one in sorted(records, key=lambda one: (rank.get(one.ablation, len(rank)), name(one), one.seed)):
+        groups.setdefault(name(one), []).append(one)
+    return groups
+
+
+def _reading(one: Record) -> str:
+    """The name of a row for a changed run: all that sets it apart from the row without changes."""
+    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join(one.changes)}"
+
+
+def _of_other_code(records: Iterable[Record]) -> str:
+    """Which of the runs of a store are not of the present code, and in which files they differ."""
+    runs: dict[str, list[str]] = {}
+    for one in records:
+        if files := code.differing(one.origin):
+            runs.setdefault(", ".join(files), []).append(f"{one.ablation}-s{one.seed}")
+    shown = [f"{', '.join(names)} ({files})" for files, names in runs.items()]
+    return f"Trained by other code than the present: {'; '.join(shown)}" if shown else ""
+
+
+def _of_different_code(rows: Mapping[str, list[Record]]) -> str:
+    """Which rows of published runs pool several codes; which of them is the present one does not matter."""
+    shown = []
+    for name, of_row in rows.items():
+        seeds: dict[str, list[str]] = {}
+        for one in of_row:
+            seeds.setdefault(one.origin.get("code_sha", "unknown"), []).append(f"s{one.seed}")
+        if len(seeds) > 1:
+            several = "; ".join(f"{', '.join(those)}: {sha}" for sha, those in seeds.items())
+            shown.append(f"{name} ({several})")
+    return f"Rows of runs by different code: {', '.join(shown)}" if shown else ""
+
+
+def _comparison(
+    preset: str,
+    runs: Mapping[str, list[Record]],
+    readings: Mapping[str, list[Record]],
+    of_code: str,
+    split: SplitName,
+    left_out: list[str],
+) -> Comparison:
+    cells = tables(runs, readings)
+    rows = dict(runs) | dict(readings)
+    settings = (rows.get("cgp") or next(iter(rows.values())))[0].settings
+    return Comparison(
+        preset,
+        cells,
+        claims(runs),
+        {name: [one.run_id for one in of_row] for name, of_row in rows.items()},
+        _commands(runs, readings, split),
+        " ".join(f"{key}={settings[key]}" for key in paper.OPEN if key in settings),
+        _reasons(cells),
+        of_code,
+        split,
+        left_out,
+    )
+
+
+def _reasons(cells: Iterable[Cell]) -> dict[str, str]:
+    """The most likely reasons of the rows that differ from the paper's."""
+    none, *_ = COLLISIONS.values()
+    found: dict[str, str] = {}
+    for ablation, row in METHODS.items():
+        differing = {cell.column for cell in cells if cell.row == row and cell.differs}
+        reasons = [paper.UNGUIDED[ablation]] if none in differing and ablation in paper.UNGUIDED else []
+        reasons += [paper.GUIDED] if differing - {none} else []
+        if reasons:
+            found[row] = "; ".join(reasons)
+    return found
+
+
+def _commands(
+    runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]], split: SplitName
+) -> dict[str, str]:
+    """What makes each row again, by the row's name."""
+    found = {name: _command(of_row) for name, of_row in readings.items()}
+    for ablation, of_row in runs.items():
+        name, again = METHODS.get(ablation, ablation), _command(of_row)
+        found |= {name: again, f"{BASELINE}source {ablation}": again}
+        for label in labels(of_row):
+            seeds = " ".join(str(one.seed) for one in labelled(of_row, label))
+            arguments = "" if label == UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
+            run = f"{of_row[0].preset}/{ablation}-s$s"
+            evaluated = f"for s in {seeds}; do make evaluate RUN={run} SPLIT={split}{arguments}; done"
+            found[f"{name}, {label}"] = f"{again} && {evaluated}"
+    if "cgp" in runs:
+        found["default"] = _command(runs["cgp"])
+    for of_row in list(runs.values())[:1]:
+        found |= dict.fromkeys((f"{BASELINE}test data", f"{BASELINE}feasible test data"), _command(of_row[:1]))
+    return found
+
+
+def _command(runs: Sequence[Record]) -> str:
+    """What makes these runs again."""
+    seeds, one = " ".join(str(of_seed.seed) for of_seed in runs), runs[0]
+    # Without the spaces of a list, at which the shell would cut it.
+    changes = [change.replace(", ", ",") for change in one.changes]
+    arguments = f" ARGS='{' '.join(changes)}'" if changes else ""
+    return f'make ablations ABLATIONS={one.ablation} SEEDS="{seeds}" PRESET={one.preset}{arguments}'

@@ -1,0 +1,144 @@
+"""What is compared of a finished run: read from MLflow, or from a file of record under runs/reference/."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from mlflow.entities import Run
+
+from conflow.errors import ConfigError
+from conflow.tracking import code, recording, store
+from conflow.training import config
+from conflow.training.config import SPLITS, SplitName, flatten
+from conflow.training.evaluation import EVALUATED_ON_VALIDATION
+
+FOLDER = store.RUNS / "reference" / "runs"
+PUBLISHED = ("test/", "validation/", "without_model/", "source/", "evaluate/")
+VALIDATED = {"validation/": "test/", EVALUATED_ON_VALIDATION: "evaluate/"}
+"""How metrics of the validation split begin, and those of the test split that they correspond to."""
+SUCCESS = re.compile(r"/success_(rate|low|high|count)$")
+ORIGIN = ("code_sha", "code", "git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run's numbers, and all that is needed to get them again.
+
+    Attributes:
+        run_id: in the store that it was tracked in.
+        settings: its whole config, flat, as text.
+        metrics: the results, without the curves of training.
+        origin: the program's revision, versions, hardware and data that it was made with.
+        seconds: that it was trained and evaluated, without those in which it was interrupted.
+    """
+
+    run_id: str
+    ablation: str
+    preset: str
+    seed: int
+    settings: dict[str, str]
+    metrics: dict[str, float]
+    origin: dict[str, str]
+    seconds: float
+
+    @classmethod
+    def of(cls, run: Run) -> "Record":
+        """The record of a finished run."""
+        tags = run.data.tags
+        metrics = {key: value for key, value in sorted(run.data.metrics.items()) if key.startswith(PUBLISHED)}
+        if not any(key.startswith("validation/") for key in metrics):
+            # The same change made success what it is now; before, it ignored the obstacle and passed between waypoints.
+            metrics = {SUCCESS.sub(r"/success_at_waypoints_\1", key): value for key, value in metrics.items()}
+        origin = {key: tags[key] for key in ORIGIN if key in tags}
+        settings = dict(sorted(run.data.params.items()))
+        where = (str(run.info.run_id), tags["ablation"], tags["preset"], int(tags["seed"]))
+        return cls(*where, settings, metrics, origin, recording.at_work(run))
+
+    @classmethod
+    def read(cls, path: Path) -> "Record":
+        """The record that `write` left in a file.
+
+        Raises:
+            ConfigError: it is none.
+        """
+        try:
+            return cls(**json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise ConfigError(f"{path}: expected the record of a run, found {' '.join(str(error).split())}") from None
+
+    def write(self, folder: Path) -> Path:
+        """The file of this record in a folder; where one of another run of the same experiment was, it is replaced."""
+        # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
+        name = re.sub(r"[^\w.=+-]+", "_", "-".join([self.ablation, self.preset, *self.changes, f"s{self.seed}"]))
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{name}.json"
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        return path
+
+    def measured(self, split: SplitName) -> bool:
+        """Whether the run was measured on a split; of one from before there is the test split alone."""
+        return any(key.startswith(f"{SPLITS[split]}/") for key in self.metrics)
+
+    def on(self, split: SplitName) -> "Record":
+        """The record with the results of one split alone, under the test split's names, which the tables read."""
+        metrics = {}
+        for key, value in self.metrics.items():
+            of_validation = next((prefix for prefix in VALIDATED if key.startswith(prefix)), None)
+            if of_validation is None:
+                if split == "test" or not key.startswith(tuple(VALIDATED.values())):
+                    metrics[key] = value
+            elif split == "val":
+                metrics[VALIDATED[of_validation] + key.removeprefix(of_validation)] = value
+        return replace(self, metrics=metrics)
+
+    @cached_property
+    def changes(self) -> list[str]:
+        """The settings that are not those of the ablation at the preset, as arguments."""
+        named = flatten(config.load([f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]).tree())
+        changed = {key: value for key, value in self.settings.items() if value != str(named.get(key, value))}
+        return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
+
+
+def finished(preset: str) -> list[Run]:
+    """The finished runs at a preset, those of the present code first, the newest of either first."""
+    return sorted(store.runs("FINISHED", preset=preset), key=lambda run: bool(code.differing(run.data.tags)))
+
+
+def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
+    """The first of the `finished` runs of every ablation and seed at a preset, with arguments as they were trained."""
+    newest: dict[tuple[str, int], Record] = {}
+    for run in finished(preset):
+        ablation, seed = run.data.tags["ablation"], int(run.data.tags["seed"])
+        if ablation not in config.names("ablation"):
+            continue
+        try:
+            asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
+        except ConfigError:
+            continue  # the arguments do not go with this ablation, so nobody has trained it with them
+        if run.data.tags["config_sha"] == asked.sha():
+            newest.setdefault((ablation, seed), Record.of(run))
+    return sorted(newest.values(), key=lambda record: record.seed)
+
+
+def from_files() -> list[Record]:
+    """All records under runs/reference/, by seed.
+
+    Raises:
+        ConfigError: there is none, or a file is none.
+    """
+    paths = sorted(FOLDER.glob("*.json"))
+    if not paths:
+        expected = f"expected records in {FOLDER}, as a checkout of the repository has them"
+        raise ConfigError(f"reference: {expected}, found none; try: make reference")
+    return sorted(map(Record.read, paths), key=lambda record: record.seed)
+
+
+def publish(preset: str) -> list[Path]:
+    """Write the first of the `finished` runs of every experiment and seed at a preset into runs/reference/."""
+    newest: dict[str, Run] = {}
+    for run in finished(preset):
+        newest.setdefault(run.data.tags["config_sha"], run)
+    return [Record.of(run).write(FOLDER) for run in newest.values()]

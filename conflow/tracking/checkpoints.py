@@ -1,0 +1,155 @@
+"""The state of training on disk: written whole or not at all, read without running code, and when it is written."""
+
+import io
+import os
+import time
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.plugins.io import CheckpointIO
+
+from conflow.errors import ConfigError
+
+SECONDS = 60.0
+"""The most training that is lost to an interruption, beside the step in progress."""
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint that cannot be written or read: which, why, and what there is instead, in one line."""
+
+
+class AtomicCheckpointIO(CheckpointIO):
+    """Checkpoints that are complete whenever they bear their name, and the one before."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a sibling, sync it, and rename it; a `last.ckpt` that bore the name becomes `previous.ckpt`.
+
+        Raises:
+            CheckpointError: it could not be written; what was there is untouched.
+        """
+        # In memory first: the disk's errors then come as what they are, not as torch's.
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        write(Path(path), content.getbuffer(), Path(path).with_name(PREVIOUS) if Path(path).name == LAST else None)
+
+    def load_checkpoint(
+        self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """The checkpoint, as `load`, whatever Lightning asks for."""
+        return load(Path(path))
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        Path(path).unlink(missing_ok=True)
+
+
+class Checkpoints(Callback):
+    """Saves the state of training into a folder after every validation, at the end, and every minute in between.
+
+    Comes last among the callbacks, so that all others have done their part of the step when it saves.
+    """
+
+    def __init__(self, folder: Path, val_every: int) -> None:
+        self.path, self.val_every = folder / LAST, val_every
+        self.saved = 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        self.saved = time.monotonic()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        # Where a validation follows, its results belong into what is saved: Lightning would not run it again.
+        if time.monotonic() - self.saved > SECONDS and trainer.global_step % self.val_every:
+            self._save(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
+        self._save(trainer)
+
+    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
+        self._save(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
+        if trainer.logger is not None:
+            trainer.logger.save()  # a step before the checkpoint is not taken again, so its metrics must be safe
+        trainer.save_checkpoint(self.path)
+        self.saved = time.monotonic()
+
+
+def write(path: Path, content: bytes | memoryview, previous: Path | None = None) -> None:
+    """Replace a file's content at once, so that no interruption leaves half of it.
+
+    Args:
+        path: the file.
+        content: all of it.
+        previous: the name that the file gets that was there.
+
+    Raises:
+        CheckpointError: it could not be written; what was there is untouched.
+    """
+    temporary = path.with_suffix(".tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if previous is not None and path.exists():
+            path.replace(previous)
+        temporary.replace(path)
+        _sync(path.parent)
+    except OSError as error:
+        kept = f"kept the one before it, {path}" if path.exists() else "there is none before it"
+        raise CheckpointError(f"{path}: expected to write a checkpoint, found {error.strerror}; {kept}") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """The checkpoint in a file. Reads weights and plain values; code in the file is not run.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: it is truncated, damaged, or none of ours.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        checkpoint = None if damaged else torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Exception:  # a foreign or damaged file fails in any of a dozen ways, from EOFError to KeyError
+        checkpoint = None
+    if not isinstance(checkpoint, Mapping) or "conflow" not in checkpoint:
+        raise CheckpointError(f"{path}: expected a checkpoint of ConFlow, found a damaged or foreign file")
+    return dict(checkpoint)
+
+
+def newest(folder: Path) -> tuple[Path | None, int, list[str]]:
+    """The newest complete checkpoint of training in a folder, its step, and what is wrong with newer ones.
+
+    None and step 0 where there is none.
+    """
+    refused: list[str] = []
+    for path in (folder / LAST, folder / PREVIOUS):
+        try:
+            checkpoint = load(path)
+            if "loops" in checkpoint:
+                return path, checkpoint["global_step"], refused
+            refused.append(f"{path}: expected the state of a training, found a model alone")
+        except FileNotFoundError:
+            pass
+        except CheckpointError as error:
+            refused.append(str(error))
+    return None, 0, refused
+
+
+def _sync(folder: Path) -> None:
+    """Make renames in a folder survive a power loss."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,161 @@
+"""Demonstrations for training and evaluation: generated or read, labelled, split, and served in whole batches."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, TensorDataset
+
+from conflow.scene import trajectories
+from conflow.scene.trajectories import DemonstrationError
+from conflow.training.build import random_stream, repaired, robot_avoidance
+from conflow.training.config import Config, SplitName
+from conflow.training.memory import check_memory
+
+
+class Split(NamedTuple):
+    """Trajectories x_1 (N, T, D) and whether they violate the constraint, M (N,)."""
+
+    x: Tensor
+    violates: Tensor
+
+    def feasible(self) -> "Split":
+        """D+ alone."""
+        return Split(self.x[~self.violates], self.violates[~self.violates])
+
+
+class Batches:
+    """x_1 ~ q(x_1): `steps` whole batches drawn by index from memory, each a function of (seed, step) alone.
+
+    Iteration starts after `step` batches, which `state_dict` remembers.
+
+    Args:
+        negative_share: of D- in each batch; None draws from all alike.
+    """
+
+    def __init__(
+        self, split: Split, batch_size: int, steps: int, seed: int, negative_share: float | None = None
+    ) -> None:
+        self.split, self.steps, self.seed = split, steps, seed
+        parts = [(torch.ones_like(split.violates), batch_size)]
+        if negative_share is not None:
+            negatives = round(negative_share * batch_size)
+            parts = [(split.violates, negatives), (~split.violates, batch_size - negatives)]
+        self.parts = [(chosen.nonzero()[:, 0], count) for chosen, count in parts if count]
+        self.step = 0
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        x, violates = self.split
+        for step in range(self.step, self.steps):
+            # Drawn where the data are: a copy from the host at every step would make an accelerator wait.
+            noise = random_stream("batch", self.seed, step, device=x.device)
+            i = torch.cat(
+                [
+                    part[torch.randint(len(part), (count,), generator=noise, device=x.device)]
+                    for part, count in self.parts
+                ]
+            )
+            self.step = step + 1
+            yield x[i], violates[i]
+
+    def state_dict(self) -> dict[str, int]:
+        return {"step": self.step}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.step = state["step"]
+
+
+class DemonstrationData(LightningDataModule):
+    """The demonstrations of one experiment.
+
+    `train` and `val` hold D+ and D-, or D+ alone where `data.negatives` is false. `test` always holds both: its
+    trajectories only lend their starts and goals to the samples, so every ablation is asked the same questions.
+    `train` keeps no trajectory of `val` or `test`.
+
+    Attributes:
+        held_out: what models are measured on, D+ and D- as they were demonstrated: `test`, and all of the validation
+            split, of which `val` is what val/loss is taken on.
+        origin: where the demonstrations are from, as messages say it.
+        x, violates: all demonstrations and their labels M.
+        digest: fingerprint of x, and of the labels that came with it; others follow from x and the config.
+
+    Raises:
+        DemonstrationError: the demonstrations cannot be used, or a class that the ablation needs is missing.
+        ConfigError: so many demonstrations or samples do not fit into this machine's memory.
+    """
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = config
+        self.origin, (x, violates) = self._demonstrations()
+        trajectories.check(x, self.origin)
+        self.x = x
+        self.T, self.D = x.shape[1:]
+        # x_1, and of either split x_0 and what each of the three settings makes of it; the metrics join one, and double
+        # its precision.
+        check_memory("sample.num", config.sample.num, 12 * 4 * config.sample.num * self.T * self.D)
+        self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
+        self.digest = trajectories.digest(x, violates)
+        self.held_out: dict[SplitName, Split] = {}
+        self.train, self.val, self.test = self._split(self.origin)
+
+    def _demonstrations(self) -> tuple[str, trajectories.Demonstrations]:
+        data = self.config.data
+        if data.path is not None:
+            return f"data.path={data.path}", trajectories.load(data.path)
+        # The whole once more in the splits, and twice while it is generated.
+        check_memory("data.num", data.num, 4 * 4 * data.num * data.horizon * 4)
+        x = trajectories.swap(data.num, data.horizon, data.amplitudes, data.jitter, data.seed)
+        return "generated demonstrations", trajectories.Demonstrations(x, None)
+
+    def _split(self, name: str) -> tuple[Split, Split, Split]:
+        data = self.config.data
+        order = torch.randperm(len(self.x), generator=random_stream("split", data.seed))
+        val, test = round(data.val_fraction * len(order)), round(data.test_fraction * len(order))
+        parts = torch.split(order, [len(order) - val - test, val, test])
+        train_split, val_split, test_split = (Split(self.x[i], self.violates[i]) for i in parts)
+        self.held_out |= {"val": val_split, "test": test_split}
+        if len(train_split.x) and bool(train_split.violates.all()):
+            raise DemonstrationError(
+                f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, expected D+ too"
+            )
+        if data.negatives:
+            if not bool(train_split.violates.any()):
+                raise DemonstrationError(
+                    f"{name}: no trajectory for training violates the constraint, and ablation "
+                    f"{self.config.ablation} needs D-"
+                )
+        else:
+            train_split, val_split = train_split.feasible(), val_split.feasible()
+        if data.repair:
+            train_split, val_split = self._repaired(train_split), self._repaired(val_split)
+        # Of a single test trajectory there is no diversity.
+        for part, split, needed in (
+            ("training", train_split, 1),
+            ("validation", val_split, 1),
+            ("test", test_split, 2),
+        ):
+            if len(split.x) < needed:
+                left = f"{len(split.x)} trajectories are left for {part} out of {len(self.x)}"
+                raise DemonstrationError(f"{name}: {left}, expected {needed} or more")
+        return train_split, val_split, test_split
+
+    def _repaired(self, split: Split) -> Split:
+        x = repaired(self.config, split.x)
+        return Split(x, robot_avoidance(self.config, self.D).violation(x))
+
+    def train_dataloader(self) -> Batches:
+        train = self.config.train
+        # The data move to the accelerator once, not batch by batch.
+        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        split = Split(self.train.x.to(device), self.train.violates.to(device))
+        return Batches(split, train.batch_size, train.max_steps, self.config.seed, self.config.data.negative_share)
+
+    def val_dataloader(self) -> DataLoader[tuple[Tensor, ...]]:
+        """The whole of `val` as one batch."""
+        return DataLoader(TensorDataset(*self.val), batch_size=None, sampler=[slice(None)])

@@ -1,0 +1,46 @@
+"""The results of one run, as a table for the terminal."""
+
+from rich.table import Table
+
+from conflow.training.evaluation import Metrics
+from conflow.training.module import Setting
+
+ROWS = {
+    "robot_collision_rate": "robot-collision rate",
+    "object_collision_rate": "object-collision rate",
+    "success_rate": "success rate",
+    "outside_rate": "rate of leaving the workspace",
+    "energy_distance": "energy distance to held-out D+",
+    "smoothness_median": "smoothness, median",
+    "smoothness_p95": "smoothness, 95th percentile",
+    "path_length_median": "path length per robot, median",
+    "start_error": "start error per robot",
+    "end_error": "end error per robot",
+    "diversity": "diversity",
+}
+
+
+def results_table(results: dict[Setting, Metrics], title: str) -> Table:
+    """The metrics of one run on a split, a column for each setting, each with its 95 % interval."""
+    num = int(next(iter(results.values()))["num"])
+    made = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
+    made.add_column("metric")
+    for setting in results:
+        made.add_column(setting, justify="right")
+    for key, label in ROWS.items():
+        made.add_row(label, *(_result(metrics, key) for metrics in results.values()))
+    made.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
+    return made
+
+
+def _result(metrics: Metrics, key: str) -> str:
+    """The value over its interval; nothing where the metric was left out."""
+    if key not in metrics:
+        return ""
+    low, high = (metrics[f"{key.removesuffix('_rate')}_{end}"] for end in ("low", "high"))
+    return f"{digits(metrics[key])}\n[dim]\\[{digits(low)}, {digits(high)}][/dim]"
+
+
+def digits(value: float) -> str:
+    """Four decimals; of what would lose its digits so, two of them."""
+    return f"{value:.2g}" if 0 < abs(value) < 1e-3 else f"{value:.4f}"
