@@ -1,5 +1,6 @@
 # What users type. Every command of `python -m conflow` is a target of one line; `make help` lists them.
 
+TASK     ?= swap
 ABLATION ?= cgp
 SEED     ?= 0
 PRESET   ?= quick
@@ -7,7 +8,8 @@ SEEDS    ?= 0 1 2
 ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
 JOBS     ?= 1
 RUN      ?= latest
-KIND     ?= passing
+# Tracks of people or robots, for `make demonstrations`.
+FROM     ?=
 # What results are shown of: methods and settings are chosen by val, and reported by test.
 SPLIT    ?= val
 FORMAT   ?= table
@@ -23,7 +25,11 @@ ARGS     ?=
 PYTHON := .venv/bin/python
 # A process for each core, and the tests of a file in the same one: they share what is slow to make.
 PARALLEL := -n auto --dist loadfile
+# Where the examples in docstrings are run as well.
+EXAMPLES := conflow/flow conflow/scene conflow/planner.py
 CONFLOW = $(PYTHON) -m conflow
+# A task of one's own, which no run holds.
+OWN = $(if $(filter %.py,$(TASK)),task=$(TASK))
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
@@ -31,36 +37,37 @@ WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 help:  ## List what can be made
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
-	@echo '  Variables: ABLATION=$(ABLATION) SEED=$(SEED) PRESET=$(PRESET) PORT=$(PORT) ARGS="key=value ..."'
+	@echo '  Variables: TASK=$(TASK) ABLATION=$(ABLATION) SEED=$(SEED) PRESET=$(PRESET) PORT=$(PORT) ARGS="key=value ..."'
 	@echo "  Ablations: $(basename $(notdir $(wildcard conf/ablation/*.yaml)))"
+	@echo "  Tasks:     $(basename $(notdir $(wildcard conf/task/*.yaml))), or a file of your own: TASK=my_task.py"
 	@echo "  Presets:   $(basename $(notdir $(wildcard conf/preset/*.yaml)))"
 
-train: .venv/installed  ## Train, sample, evaluate and track one experiment: ABLATION= SEED= PRESET= SPLIT= ARGS=
-	@$(CONFLOW) train ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) split=$(SPLIT) $(ARGS)
+train: .venv/installed  ## Train, sample, evaluate and track one experiment: TASK= ABLATION= SEED= PRESET= SPLIT= ARGS=
+	@$(CONFLOW) train task=$(TASK) ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) split=$(SPLIT) $(ARGS)
 
-ablations: .venv/installed  ## Train every ablation for every seed, and compare: SEEDS= ABLATIONS= PRESET= JOBS= SPLIT= ARGS=
-	@$(CONFLOW) ablations seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) split=$(SPLIT) $(ARGS)
+ablations: .venv/installed  ## Train every ablation for every seed, and compare: TASK= SEEDS= ABLATIONS= PRESET= JOBS= SPLIT= ARGS=
+	@$(CONFLOW) ablations task=$(TASK) seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) split=$(SPLIT) $(ARGS)
 
 evaluate: .venv/installed  ## Sample a finished run again with other settings: RUN= SPLIT=val|test ARGS="sample.steps=50"
-	@$(CONFLOW) evaluate run=$(RUN) split=$(SPLIT) $(ARGS)
+	@$(CONFLOW) evaluate $(OWN) run=$(RUN) split=$(SPLIT) $(ARGS)
 
-compare: .venv/installed  ## Print the paper's tables and claims: PRESET= SPLIT=val|test FORMAT=table|markdown|csv|json REFERENCE=1 (published runs)
-	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(if $(REFERENCE),reference=1,split=$(SPLIT)) $(ARGS)
+compare: .venv/installed  ## Print the paper's tables and claims: TASK= PRESET= SPLIT=val|test FORMAT=table|markdown|csv|json REFERENCE=1 (published runs)
+	@$(CONFLOW) compare preset=$(PRESET) format=$(FORMAT) $(if $(REFERENCE),reference=1,task=$(TASK) split=$(SPLIT)) $(ARGS)
 
 reference: .venv/installed  ## Publish the numbers of finished runs as files in runs/reference/runs/: PRESET=
 	@$(CONFLOW) reference preset=$(PRESET)
 
-sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= SEED= ARGS="obstacle=x,y,r"
-	@$(CONFLOW) sample run=$(RUN) start="$(START)" goal="$(GOAL)" $(WRITTEN) seed=$(SEED) $(ARGS)
+sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= SEED= ARGS="obstacle=x,y,r via=s,x1,y1,..."
+	@$(CONFLOW) sample $(OWN) run=$(RUN) start="$(START)" goal="$(GOAL)" $(WRITTEN) seed=$(SEED) $(ARGS)
 
 figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,... SPLIT=
-	@$(CONFLOW) figures run=$(RUN) split=$(SPLIT)
+	@$(CONFLOW) figures $(OWN) run=$(RUN) split=$(SPLIT)
 
 explain: .venv/installed  ## Draw why the covariant correction works, and what fewer collisions cost: PRESET=
 	@$(CONFLOW) explain preset=$(PRESET)
 
-demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FILE": KIND=passing|social OUT= NUM= SEED=
-	@$(CONFLOW) demonstrations kind=$(KIND) $(WRITTEN) seed=$(SEED)
+demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FILE": TASK=passing, or FROM=tracks.csv; OUT= NUM= SEED=
+	@$(CONFLOW) demonstrations $(if $(FROM),from="$(FROM)",task=$(TASK)) $(WRITTEN) seed=$(SEED) $(ARGS)
 
 bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)
 	@$(PYTHON) -m tests.bench format=$(FORMAT) $(if $(REFERENCE),reference=1)
@@ -69,7 +76,7 @@ ui: .venv/installed  ## Open MLflow's pages of all runs: PORT=
 	@$(CONFLOW) ui port=$(PORT)
 
 test: .venv/installed  ## Run the tests
-	@OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q $(PARALLEL) tests --ignore=tests/faults $(ARGS)
+	@OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q $(PARALLEL) --doctest-modules $(EXAMPLES) tests --ignore=tests/faults $(ARGS)
 
 test-faults: .venv/installed  ## Run the tests that kill processes, fill disks and break files
 	@OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q $(PARALLEL) tests/faults $(ARGS)

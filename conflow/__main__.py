@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from conflow.scene.task import Task
+
 
 def train(arguments: list[str]) -> None:
     """Train, sample, evaluate and track one experiment, split=val to print; or go on with one: resume=RUN, code=any."""
@@ -82,12 +84,12 @@ def evaluate(arguments: list[str]) -> None:
     from conflow.tracking import signals
 
     signals.raise_on_signals()
-    options, settings = commandline.options(arguments, {"run": "latest", "split": "val"})
+    options, settings = commandline.options(arguments, {"run": "latest", "split": "val", "task": ""})
     split = commandline.held_out(options)
 
     from conflow.training.reload import evaluate_again
 
-    evaluate_again(options["run"], settings, split, console())
+    evaluate_again(options["run"], settings, split, console(), _task(options))
 
 
 def compare(arguments: list[str]) -> None:
@@ -126,24 +128,34 @@ def reference(arguments: list[str]) -> None:
 
 
 def sample(arguments: list[str]) -> None:
-    """Plan from start= to goal= and draw it: run=latest out=plans.npz num=64 seed=0 guidance=both obstacle=x,y,r."""
+    """Plan from start= to goal= and draw: run=latest out=plans.npz num=64 seed=0 guidance=all obstacle=x,y,r via=s,x"""
     from conflow import commandline
     from conflow.tracking import signals
-    from conflow.training import config
 
     signals.raise_on_signals()
-    defaults = {"run": "latest", "out": "plans.npz", "num": "64", "guidance": "both", "seed": "0"}
-    options, _ = commandline.options(arguments, {"start": "", "goal": "", "obstacle": ""} | defaults, settings=False)
-    # The one option that may be given several times.
-    obstacles = [value for key, value in map(config.split, arguments) if key == "obstacle"]
+    defaults = {"run": "latest", "out": "plans.npz", "num": "64", "guidance": "all", "seed": "0", "task": ""}
+    own = {"start": "", "goal": "", "obstacle": "", "via": ""} | defaults
+    options, _ = commandline.options(arguments, own, settings=False)
+    # The options that may be given several times.
+    several = {name: commandline.repeated(arguments, name) for name in ("obstacle", "via")}
     for key in ("start", "goal"):
         if not options[key]:
             example = 'make sample START="-0.8,0,0.8,0" GOAL="0.8,0,-0.8,0"'
             raise errors.ConfigError(f"{key}: expected the robots' positions, found none; try: {example}")
 
-    from conflow import planner
+    from conflow.sample import sample
 
-    print(planner.sample(options, obstacles))
+    print(sample(options, several["obstacle"], several["via"], _task(options)))
+
+
+def _task(options: "Mapping[str, str]") -> "Task | None":
+    """The task of one's own that the option names; whatever else it names, a run knows itself."""
+    from pathlib import Path
+
+    from conflow.training import config
+    from conflow.training.build import task_of_file
+
+    return task_of_file(Path(options["task"])) if config.is_file(options["task"]) else None
 
 
 def figures(arguments: list[str]) -> None:
@@ -152,12 +164,12 @@ def figures(arguments: list[str]) -> None:
     from conflow.tracking import signals
 
     signals.raise_on_signals()
-    options, _ = commandline.options(arguments, {"run": "latest", "split": "val"}, settings=False)
+    options, _ = commandline.options(arguments, {"run": "latest", "split": "val", "task": ""}, settings=False)
     split = commandline.held_out(options)
 
     from conflow.figures import gallery
 
-    gallery.draw(options["run"].split(","), split, console())
+    gallery.draw(options["run"].split(","), split, console(), _task(options))
 
 
 def explain(arguments: list[str]) -> None:
@@ -178,24 +190,18 @@ def explain(arguments: list[str]) -> None:
 
 
 def demonstrations(arguments: list[str]) -> None:
-    """Write demonstrations of another kind, for data.path: kind=passing, or social, out=KIND.npz num=3000 seed=0."""
+    """Write demonstrations for data.path, of a task= or from=TRACKS.csv agents=2 seconds=6 T=32: out= num= seed=0."""
     from conflow import commandline
     from conflow.tracking import signals
 
     signals.raise_on_signals()
-    defaults = {"kind": "passing", "out": "KIND.npz", "num": "3000", "seed": "0"}
-    options, _ = commandline.options(arguments, defaults, settings=False)
-    num, seed = commandline.whole(options, "num", 10, 10**5), commandline.whole(options, "seed", 0, 2**32 - 1)
+    defaults = {"task": "swap", "from": "", "out": "", "num": "3000", "seed": "0"}
+    tracked = {"agents": "2", "seconds": "6", "T": "32", "fps": "", "opposite": "1"}
+    options, _ = commandline.options(arguments, defaults | tracked, settings=False)
 
-    from conflow.scene.trajectories import KINDS, save
+    from conflow.demonstrations import from_task, from_tracks
 
-    kind = options["kind"]
-    if kind not in KINDS:
-        offer = errors.nearest(kind, list(KINDS))
-        raise errors.ConfigError(f"kind={errors.brief(kind)}: expected {' or '.join(KINDS)}{offer}")
-    out = f"{kind}.npz" if options["out"] == defaults["out"] else options["out"]
-    save(out, KINDS[kind](num, seed=seed))
-    print(f"Written: {out}; train on it with: make train ARGS=data.path={out}")
+    print(from_tracks(options) if options["from"] else from_task(options))
 
 
 def ui(arguments: list[str]) -> None:
@@ -286,7 +292,7 @@ def _exit_code(error: BaseException) -> int:
 def _reason(error: BaseException) -> str | None:
     """What a known failure says; None of any other."""
     from conflow.errors import ConfigError
-    from conflow.scene.trajectories import DemonstrationError
+    from conflow.scene.errors import DemonstrationError
 
     if isinstance(error, ConfigError | DemonstrationError):
         return str(error)

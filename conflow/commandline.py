@@ -1,5 +1,6 @@
 """The options of commands: arguments `key=value` beside the settings of an experiment."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 from conflow.errors import ConfigError, brief, nearest
@@ -23,6 +24,26 @@ def options(arguments: Sequence[str], defaults: Mapping[str, str], settings: boo
             offer = nearest(key, list(chosen))
             raise ConfigError(f"{brief(key)}: no such option, expected {', '.join(chosen)}{offer}")
     return chosen, rest
+
+
+def repeated(arguments: Sequence[str], name: str) -> list[str]:
+    """All values of an option that may be given several times."""
+    return [value for key, value in map(split, arguments) if key == name and value]
+
+
+def number(options: Mapping[str, str], key: str) -> float:
+    """An option that is a finite number.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    try:
+        value = float(options[key])
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigError(f"{key}={brief(options[key])}: expected a finite number")
+    return value
 
 
 def whole(options: Mapping[str, str], key: str, low: int, high: int) -> int:

@@ -13,7 +13,7 @@ from rich.console import Console
 from conflow.errors import ConfigError
 from conflow.flow.path import interpolate, velocity
 from conflow.flow.sampler import integrate
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
 from conflow.tracking import store
 from conflow.training import config
 from conflow.training.build import build_source
@@ -94,7 +94,7 @@ def test_the_raw_loop_is_the_same_mathematics(smoke: config.Config) -> None:
     torch.testing.assert_close(raw.W, source.mean_map.float(), rtol=0, atol=1e-5)
     torch.testing.assert_close((raw.L @ raw.L.mT).double(), source.covariance, rtol=0, atol=1e-6)
     x_1 = swap(100)
-    M, t = raw.model.robots.violation(x_1), torch.rand(100, generator=generator())
+    M, t = raw.model.judged["robot"].violation(x_1), torch.rand(100, generator=generator())
     x_0 = source.sample(source.observe(x_1), generator())
     x_t, target = raw.target(x_0, x_1, t, M)
     torch.testing.assert_close(x_t, interpolate(x_0, x_1, t), rtol=0, atol=1e-6)

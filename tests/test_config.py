@@ -31,6 +31,11 @@ CHANGES = {
     },
     "few_steps": {"sample.solver", "sample.steps"},
 }
+CHANGES["descent"] = {
+    *("data.negatives", "source.fit", "constraint.gamma", "network.kind", "train.norm", "train.max_steps"),
+    *("correction.lambda_c", "correction.smoothing", "correction.margin", "correction.walls"),
+    *("sample.num", "sample.steps", "sample.guidance", "sample.robot_weight", "sample.obstacle_weight"),
+}
 CHANGES["plus"] = (CHANGES["end"] | CHANGES["spectral"] | CHANGES["fitted"]) - {"source.modes"} | {
     "constraint.gamma",
     "correction.ramp",

@@ -8,32 +8,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from conflow.scene.constraint import (
-    Barrier,
-    BarrierShape,
-    Constraint,
-    Obstacle,
-    ObstacleAvoidance,
-    Reduction,
-    RobotAvoidance,
-    Sum,
-    Workspace,
-)
-from conflow.scene.robots import PointRobots
+from conflow.scene.constraint import Barrier, Constraint, Sum, Workspace
+from conflow.scene.robots import Discs
+from conflow.scene.settings import BarrierShape, Obstacle, Reduction
+from tests.papers import keep_apart, keep_clear
 
 OBSTACLES = [Obstacle(0.0, 0.5, 0.1), Obstacle(-0.4, 0.0, 0.2), Obstacle(0.3, -0.3, 0.05)]
-TWO, THREE = PointRobots(2), PointRobots(3)
+TWO, THREE = Discs(2), Discs(3)
 
-CONSTRAINTS: dict[str, tuple[PointRobots, Callable[[Barrier], Constraint]]] = {
-    "two robots": (TWO, lambda barrier: RobotAvoidance(TWO, 0.3, barrier)),
-    "three robots": (THREE, lambda barrier: RobotAvoidance(THREE, 0.3, barrier)),
-    "two robots, one obstacle": (TWO, lambda barrier: ObstacleAvoidance(TWO, OBSTACLES[:1], 0.15, barrier)),
-    "three robots, three obstacles": (THREE, lambda barrier: ObstacleAvoidance(THREE, OBSTACLES, 0.15, barrier)),
+CONSTRAINTS: dict[str, tuple[Discs, Callable[[Barrier], Constraint]]] = {
+    "two robots": (TWO, lambda barrier: keep_apart(2, 0.3, barrier)),
+    "three robots": (THREE, lambda barrier: keep_apart(3, 0.3, barrier)),
+    "two robots, one obstacle": (TWO, lambda barrier: keep_clear(2, OBSTACLES[:1], 0.15, barrier)),
+    "three robots, three obstacles": (THREE, lambda barrier: keep_clear(3, OBSTACLES, 0.15, barrier)),
     # With walls at 2, so that some of `trajectories` stay within.
-    "three robots and walls": (THREE, lambda barrier: Workspace(THREE, -1.0, barrier)),
+    "three robots and walls": (THREE, lambda barrier: Workspace(THREE, -1.0).shaped(barrier)),
     "robots and obstacles": (
         THREE,
-        lambda barrier: Sum([RobotAvoidance(THREE, 0.3, barrier), ObstacleAvoidance(THREE, OBSTACLES, 0.15, barrier)]),
+        lambda barrier: Sum([keep_apart(3, 0.3, barrier), keep_clear(3, OBSTACLES, 0.15, barrier)]),
     ),
 }
 
@@ -42,7 +34,7 @@ shapes = pytest.mark.parametrize("shape", get_args(BarrierShape))
 reductions = pytest.mark.parametrize("reduction", get_args(Reduction))
 
 
-def trajectories(robots: PointRobots = TWO, batch: int = 64, T: int = 6) -> Tensor:
+def trajectories(robots: Discs = TWO, batch: int = 64, T: int = 6) -> Tensor:
     """Trajectories about the origin, some in collision and some not."""
     generator = torch.Generator().manual_seed(0)
     return 0.8 * torch.randn(batch, T, 2 * robots.count, dtype=torch.float64, generator=generator)
@@ -58,7 +50,7 @@ def apart(*distances: float) -> Tensor:
 @shapes
 @reductions
 def test_the_closed_form_gradient_is_autograds(
-    robots: PointRobots, build: Callable[[Barrier], Constraint], shape: BarrierShape, reduction: Reduction
+    robots: Discs, build: Callable[[Barrier], Constraint], shape: BarrierShape, reduction: Reduction
 ) -> None:
     """grad C equals the derivative of `barrier`, trajectory by trajectory, in and out of collision."""
     constraint = build(Barrier(shape, reduction))
@@ -75,7 +67,7 @@ def test_the_closed_form_gradient_is_autograds(
 @constraints
 @reductions
 def test_the_gradient_is_the_limit_of_finite_differences(
-    robots: PointRobots, build: Callable[[Barrier], Constraint], reduction: Reduction
+    robots: Discs, build: Callable[[Barrier], Constraint], reduction: Reduction
 ) -> None:
     """Central differences of C over every coordinate of a trajectory."""
     constraint = build(Barrier("softplus", reduction))
@@ -96,7 +88,7 @@ def test_the_barrier_of_a_trajectory_made_by_hand(reduction: Reduction) -> None:
     relu = sum(min(d - 0.25, 0) for d in counted)
     shapes: tuple[tuple[BarrierShape, float], ...] = (("softplus", share * softplus), ("relu", share * relu))
     for shape, expected in shapes:
-        C = RobotAvoidance(TWO, 0.25, Barrier(shape, reduction, gamma=10)).barrier(apart(*distances))
+        C = keep_apart(2, 0.25, Barrier(shape, reduction, gamma=10)).barrier(apart(*distances))
         assert C.tolist() == pytest.approx([expected], abs=1e-14)  # float64 rounding
 
 
@@ -105,7 +97,7 @@ def test_the_gradient_of_a_trajectory_made_by_hand(reduction: Reduction) -> None
     """The robots are pushed apart along the line between them, by the logistic function of -gamma (d - r)."""
     distances = (0.5, 0.15, 0.3)
     share = 1 / 3 if reduction == "mean" else 1
-    gradient = RobotAvoidance(TWO, 0.25, Barrier("softplus", reduction, gamma=10)).gradient(apart(*distances))
+    gradient = keep_apart(2, 0.25, Barrier("softplus", reduction, gamma=10)).gradient(apart(*distances))
     for d, (x_1, y_1, x_2, y_2) in zip(distances, gradient[0].tolist(), strict=True):
         slope = share / (1 + math.exp(10 * (d - 0.25))) if reduction != "closest" or d == 0.15 else 0
         assert (x_1, y_1, x_2, y_2) == pytest.approx((slope, 0, -slope, 0), abs=1e-14)  # float64 rounding
@@ -116,8 +108,8 @@ def test_the_gradient_of_a_trajectory_made_by_hand(reduction: Reduction) -> None
 def test_softplus_stays_below_relu_and_approaches_it(reduction: Reduction, gamma: float) -> None:
     """0 <= relu - softplus <= log 2 / gamma at each waypoint that counts."""
     x = trajectories()
-    relu = RobotAvoidance(TWO, barrier=Barrier("relu", reduction)).barrier(x)
-    softplus = RobotAvoidance(TWO, barrier=Barrier("softplus", reduction, gamma)).barrier(x)
+    relu = keep_apart(2, barrier=Barrier("relu", reduction)).barrier(x)
+    softplus = keep_apart(2, barrier=Barrier("softplus", reduction, gamma)).barrier(x)
     counted = x.shape[1] if reduction == "sum" else 1
     gap = relu - softplus
     assert bool((gap >= 0).all())
@@ -129,7 +121,7 @@ def test_softplus_stays_below_relu_and_approaches_it(reduction: Reduction, gamma
 @pytest.mark.parametrize("distance", [0.0, 1e-42, 1e-30, 1e-20, 1e-9, 1e-8, 1e-7, 1e-3])
 @pytest.mark.parametrize(
     ("constraint", "other"),
-    [(RobotAvoidance(TWO, 0.3), 0.0), (ObstacleAvoidance(TWO, [Obstacle(0.0, 0.0, 0.15)], 0.15), 1.0)],
+    [(keep_apart(2, 0.3), 0.0), (keep_clear(2, [Obstacle(0.0, 0.0, 0.15)], 0.15), 1.0)],
     ids=["robots", "obstacle"],
 )
 def test_the_push_of_bodies_that_all_but_coincide_stays_bounded(
@@ -147,7 +139,7 @@ def test_the_push_of_bodies_that_all_but_coincide_stays_bounded(
 
 def test_a_step_along_the_gradient_opens_the_clearance_by_twice_the_slope() -> None:
     """Two robots that go eta grad C each are 2 eta dC/dc further apart at every waypoint."""
-    constraint = RobotAvoidance(TWO)
+    constraint = keep_apart(2)
     x, eta = trajectories(), 0.01
     before = constraint.clearance(x)
     opened = constraint.clearance(x + eta * constraint.gradient(x)) - before
@@ -158,7 +150,7 @@ def test_a_step_along_the_gradient_opens_the_clearance_by_twice_the_slope() -> N
 @shapes
 @reductions
 def test_a_small_step_along_the_gradient_improves_a_colliding_trajectory(
-    robots: PointRobots, build: Callable[[Barrier], Constraint], shape: BarrierShape, reduction: Reduction
+    robots: Discs, build: Callable[[Barrier], Constraint], shape: BarrierShape, reduction: Reduction
 ) -> None:
     """C grows by eta |grad C|^2 to first order."""
     constraint = build(Barrier(shape, reduction))
@@ -180,7 +172,7 @@ def test_robots_collide_where_they_are_nearer_than_the_radius(
     x = torch.zeros(1, 5, 3, 2)
     x[0, :, :, 1] = torch.tensor([-1.0, 0.0, 1.0])
     x[0, waypoint, pair[1]] = x[0, waypoint, pair[0]] + torch.tensor([0.25 + gap, 0.0])
-    constraint = RobotAvoidance(THREE, 0.25)
+    constraint = keep_apart(3, 0.25)
     assert constraint.violation(x.flatten(2)).tolist() == [violates]
     assert constraint.clearance(x.flatten(2)).amin() == gap
 
@@ -196,7 +188,7 @@ def test_a_robot_touches_an_obstacle_at_the_sum_of_their_radii(
     x = torch.full((1, 5, 2, 2), 2.0)
     centre = torch.tensor([obstacles[obstacle].x, obstacles[obstacle].y])
     x[0, 3, robot] = centre + torch.tensor([1 / 8 + obstacles[obstacle].radius + gap, 0.0])
-    constraint = ObstacleAvoidance(TWO, obstacles, robot_radius=1 / 8)
+    constraint = keep_clear(2, obstacles, robot_radius=1 / 8)
     assert constraint.violation(x.flatten(2)).tolist() == [violates]
     assert constraint.clearance(x.flatten(2)).amin() == gap
 
@@ -204,7 +196,7 @@ def test_a_robot_touches_an_obstacle_at_the_sum_of_their_radii(
 @constraints
 @reductions
 def test_the_clearance_is_that_of_a_loop_over_all_bodies(
-    robots: PointRobots, build: Callable[[Barrier], Constraint], reduction: Reduction
+    robots: Discs, build: Callable[[Barrier], Constraint], reduction: Reduction
 ) -> None:
     """The smallest of all gaps, computed one by one, whatever the barrier."""
     constraint = build(Barrier(reduction=reduction))
@@ -225,7 +217,7 @@ def test_the_clearance_is_that_of_a_loop_over_all_bodies(
 @reductions
 def test_which_robot_is_which_does_not_matter(shape: BarrierShape, reduction: Reduction) -> None:
     """Swapping two of three robots leaves C and c as they are and swaps the gradient."""
-    constraint = RobotAvoidance(THREE, barrier=Barrier(shape, reduction))
+    constraint = keep_apart(3, barrier=Barrier(shape, reduction))
     x, swapped = trajectories(THREE), [2, 3, 0, 1, 4, 5]
     torch.testing.assert_close(constraint.barrier(x[..., swapped]), constraint.barrier(x), rtol=0, atol=1e-14)
     torch.testing.assert_close(constraint.clearance(x[..., swapped]), constraint.clearance(x), rtol=0, atol=0)
@@ -238,7 +230,7 @@ def test_which_robot_is_which_does_not_matter(shape: BarrierShape, reduction: Re
 @reductions
 def test_robot_avoidance_knows_no_place_and_no_direction(shape: BarrierShape, reduction: Reduction) -> None:
     """Moving and turning all robots together leaves C as it is and turns the gradient along."""
-    constraint = RobotAvoidance(THREE, barrier=Barrier(shape, reduction))
+    constraint = keep_apart(3, barrier=Barrier(shape, reduction))
     cos, sin = math.cos(0.7), math.sin(0.7)
     turn = torch.block_diag(*[torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)] * 3)
     x = trajectories(THREE)
@@ -251,7 +243,7 @@ def test_robot_avoidance_knows_no_place_and_no_direction(shape: BarrierShape, re
 def test_the_workspace_keeps_every_robot_from_every_wall() -> None:
     """The clearance is the distance to the nearest wall less the margin; in a corner both walls push, inwards."""
     corner = torch.tensor([[[0.95, -0.97, 0.0, 0.5]]], dtype=torch.float64)
-    walls = Workspace(TWO, 0.1, Barrier("relu"))
+    walls = Workspace(TWO, 0.1).shaped(Barrier("relu"))
     torch.testing.assert_close(walls.clearance(corner), torch.tensor([[-0.07]], dtype=torch.float64))
     assert walls.gradient(corner).tolist() == [[[-1, 1, 0, 0]]]
     assert not bool(Workspace(TWO).violation(corner).any())
@@ -260,7 +252,7 @@ def test_the_workspace_keeps_every_robot_from_every_wall() -> None:
 
 def test_a_sum_adds_barriers_and_violates_where_any_term_does() -> None:
     """C and grad C add up, the clearance is the smallest, M is 'or'; a sum is again a constraint."""
-    robots, obstacle = RobotAvoidance(TWO, 0.5), ObstacleAvoidance(TWO, OBSTACLES, 0.1)
+    robots, obstacle = keep_apart(2, 0.5), keep_clear(2, OBSTACLES, 0.1)
     x = trajectories(T=2)
     both = Sum([robots, obstacle])
     a, b = robots.violation(x), obstacle.violation(x)
@@ -277,12 +269,12 @@ def test_a_trajectory_that_is_not_finite_is_not_called_feasible() -> None:
     """M is true where the clearance is NaN: a sampler that diverged does not count as free of collisions."""
     x = apart(1.0, 1.0, 1.0)
     x[0, 1] = math.nan
-    assert RobotAvoidance(TWO).violation(x).tolist() == [True]
+    assert keep_apart(2).violation(x).tolist() == [True]
 
 
 @constraints
 def test_the_swept_clearance_is_the_smallest_of_many_moments(
-    robots: PointRobots, build: Callable[[Barrier], Constraint]
+    robots: Discs, build: Callable[[Barrier], Constraint]
 ) -> None:
     """All bodies go straight from waypoint to waypoint, seen at 2001 moments of each segment."""
     constraint = build(Barrier())
@@ -299,7 +291,7 @@ def test_the_swept_clearance_is_the_smallest_of_many_moments(
 @constraints
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_swept_clearance_is_never_above_that_of_the_waypoints(
-    robots: PointRobots, build: Callable[[Barrier], Constraint], dtype: torch.dtype
+    robots: Discs, build: Callable[[Barrier], Constraint], dtype: torch.dtype
 ) -> None:
     """To the last bit, so what collides at a waypoint collides on the way too; often it is that of an end."""
     constraint = build(Barrier())
@@ -318,19 +310,19 @@ def test_robots_that_pass_through_each_other_between_waypoints_are_found() -> No
     through = torch.tensor([[[-1.0, 0, 1, 0], [1, 0, -1, 0]]])
     past = torch.tensor([[[-1.0, 0, 1, 0.25], [1, 0, -1, 0.25]]])
     x = torch.cat([through, past])
-    constraint = RobotAvoidance(TWO, 0.5)
+    constraint = keep_apart(2, 0.5)
     assert constraint.violation(x).tolist() == [False, False]
     assert constraint.swept_clearance(x).tolist() == [[-0.5], [-0.25]]
 
 
 def test_robots_that_only_part_or_stand_still_come_no_closer_on_the_way() -> None:
     """Where there is no closer approach in between, the swept clearance is the smaller one of the ends."""
-    assert RobotAvoidance(TWO, 0.25).swept_clearance(apart(1, 2, 2, 0.5)).tolist() == [[0.75, 1.75, 0.25]]
+    assert keep_apart(2, 0.25).swept_clearance(apart(1, 2, 2, 0.5)).tolist() == [[0.75, 1.75, 0.25]]
     standing = torch.zeros(1, 2, 4, dtype=torch.float64)
-    assert RobotAvoidance(TWO, 0.25).swept_clearance(standing).tolist() == [[-0.25]]
+    assert keep_apart(2, 0.25).swept_clearance(standing).tolist() == [[-0.25]]
 
 
 def test_a_swept_clearance_that_is_not_a_number_stays_so() -> None:
     x = apart(1.0, 1.0, 1.0)
     x[0, 2] = math.nan
-    assert RobotAvoidance(TWO, 0.25).swept_clearance(x)[0].isnan().tolist() == [False, True]
+    assert keep_apart(2, 0.25).swept_clearance(x)[0].isnan().tolist() == [False, True]

@@ -8,10 +8,11 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from conflow.flow import source
-from conflow.flow.correction import Correction, Edges, covariant, gaussian_filter, repair
-from conflow.scene.constraint import Barrier, RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
+from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
+from conflow.flow.settings import Edges
+from conflow.scene.constraint import Barrier, Constraint
+from conflow.scene.tasks.swap import swap
+from tests.papers import keep_apart
 
 
 class Quadratic:
@@ -67,8 +68,8 @@ def test_the_filter_keeps_constants_inside_and_loses_them_at_the_ends() -> None:
     assert bool((rows[-4:] < 0.95).all())
 
 
-@pytest.mark.parametrize("constraint", [Quadratic(), RobotAvoidance(PointRobots(2))], ids=["quadratic", "robots"])
-def test_the_correction_filters_every_dimension_by_itself(constraint: Quadratic | RobotAvoidance) -> None:
+@pytest.mark.parametrize("constraint", [Quadratic(), keep_apart(2)], ids=["quadratic", "robots"])
+def test_the_correction_filters_every_dimension_by_itself(constraint: Quadratic | Constraint) -> None:
     """u^c is the constraint's gradient, filtered along the trajectory in each trajectory and dimension."""
     x = 0.3 * torch.randn(3, 32, 4, generator=torch.Generator().manual_seed(0))
     expected = gaussian_filter1d(constraint.gradient(x).double().numpy(), 5.0, axis=1, mode="constant", radius=4)
@@ -79,11 +80,11 @@ def test_the_correction_filters_every_dimension_by_itself(constraint: Quadratic 
 
 def test_a_checkpoint_holds_nothing_of_the_correction() -> None:
     """The correction follows from the config: its state is empty, so another one fits the same checkpoint."""
-    assert not Correction(RobotAvoidance(PointRobots(2)), gaussian_filter(32)).state_dict()
+    assert not Correction(keep_apart(2), gaussian_filter(32)).state_dict()
 
 
-def robots(margin: float = 0.0, shape: Barrier | None = None) -> RobotAvoidance:
-    return RobotAvoidance(PointRobots(2), 0.3 + margin, shape)
+def robots(margin: float = 0.0, shape: Barrier | None = None) -> Constraint:
+    return keep_apart(2, 0.3 + margin, shape)
 
 
 def colliding(num: int, T: int = 32) -> Tensor:

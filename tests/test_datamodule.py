@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from conflow.scene.trajectories import DemonstrationError, swap
+from conflow.scene.errors import DemonstrationError
+from conflow.scene.tasks.swap import swap
 from conflow.training import config
-from conflow.training.build import robot_avoidance
 from conflow.training.config import Config
 from conflow.training.datamodule import Batches, DemonstrationData, Split
+from tests.papers import label
 
 
 def rows(split: Split) -> set[bytes]:
@@ -135,7 +136,7 @@ def test_repaired_demonstrations_are_all_feasible_and_feasible_ones_are_not_touc
     repaired = DemonstrationData(config.load(["preset=smoke", "ablation=repair", "correction.margin=0.01"]))
     assert not repaired.train.violates.any()
     assert not repaired.val.violates.any()
-    far = robot_avoidance(mixed.config, 4, margin=0.01)
+    far = label(mixed.config).narrowed(0.01)
     feasible = ~far.violation(mixed.train.x)
     assert torch.equal(repaired.train.x[feasible], mixed.train.x[feasible])
     assert torch.equal(repaired.test.x, mixed.test.x)

@@ -15,23 +15,19 @@ from torch import Tensor
 
 from conflow import __main__ as command_line
 from conflow.flow.source import cgp, fit_rbf
-from conflow.scene.social_force import Robots, walk
-from conflow.scene.trajectories import (
-    KINDS,
-    SIDES,
-    DemonstrationError,
-    check,
-    digest,
-    load,
-    passing,
-    save,
-    social,
-    swap,
-)
+from conflow.scene.demonstrations import Demonstrations, check, digest, load, save
+from conflow.scene.errors import DemonstrationError
+from conflow.scene.measures import smoothness
+from conflow.scene.tasks import TASKS
+from conflow.scene.tasks.curves import SIDES
+from conflow.scene.tasks.passing import passing
+from conflow.scene.tasks.social import social
+from conflow.scene.tasks.social_force import Robots, walk
+from conflow.scene.tasks.swap import swap
 from conflow.tracking import signals
 from conflow.training import config
 from conflow.training.datamodule import DemonstrationData
-from conflow.training.metrics import smoothness
+from tests.papers import TWO
 
 
 def nearest(x: Tensor) -> Tensor:
@@ -83,7 +79,7 @@ def test_they_are_demonstrations_as_good_as_swaps() -> None:
         # float32 rounding of a coordinate below 1; 5000 draws miss 1 % of their range but for a chance of 1e-22
         assert bool((off <= 0.04 + 1e-7).all())
         assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
-    ratio = smoothness(x).quantile(0.5) / smoothness(swap(5000)).quantile(0.5)
+    ratio = smoothness(TWO, x).quantile(0.5) / smoothness(TWO, swap(5000)).quantile(0.5)
     assert 1 / 2 < float(ratio) < 2
 
 
@@ -145,13 +141,13 @@ def test_the_bulge_is_a_raised_cosine_where_the_robots_pass() -> None:
     assert float(right[nearest(x) < 0.3, 0].double().mean()) == pytest.approx(0.65, abs=4 * (0.65 * 0.35 / 2000) ** 0.5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TASKS)
 def test_a_seed_is_a_data_set(kind: str) -> None:
     """The same seed gives the same bytes, whatever happens to the global generator; another one differs."""
-    x = KINDS[kind](50, seed=7)
+    x = TASKS[kind]().demonstrations(50, seed=7)
     torch.manual_seed(0)
-    assert digest(KINDS[kind](50, seed=7)) == digest(x)
-    assert not bool((KINDS[kind](50, seed=8)[:, 0] == x[:, 0]).any())
+    assert digest(TASKS[kind]().demonstrations(50, seed=7)) == digest(x)
+    assert not bool((TASKS[kind]().demonstrations(50, seed=8)[:, 0] == x[:, 0]).any())
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -180,9 +176,9 @@ def test_social_robots_are_demonstrations_that_accelerate_and_brake() -> None:
         # float32 rounding of a coordinate below 1
         assert bool((off <= 0.04 + 1e-7).all())
         assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
-    feasible = smoothness(x[nearest(x) > 0.3])
+    feasible = smoothness(TWO, x[nearest(x) > 0.3])
     assert 0.006 < float(feasible.quantile(0.05)) < float(feasible.quantile(0.95)) < 0.02
-    assert float(feasible.median()) > 2.5 * float(smoothness(swap(3000)).median())
+    assert float(feasible.median()) > 2.5 * float(smoothness(TWO, swap(3000)).median())
 
 
 def test_what_social_robots_do_is_not_in_the_leading_modes() -> None:
@@ -328,7 +324,7 @@ def test_a_file_is_read_back_to_the_last_bit_and_trained_on(tmp_path: Path) -> N
     """`load` finds x and no labels, so the experiment computes them: 40 % violate its own threshold."""
     path = tmp_path / "passing.npz"
     x = passing(500)
-    save(path, x)
+    save(path, Demonstrations(x))
     loaded = load(path)
     assert torch.equal(loaded.x, x)
     assert loaded.violates is None
@@ -346,7 +342,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(np, "savez", full)
     with pytest.raises(DemonstrationError, match=r"passing.npz: No space left on device, expected a new file"):
-        save(tmp_path / "passing.npz", passing(10))
+        save(tmp_path / "passing.npz", Demonstrations(passing(10)))
     assert not list(tmp_path.iterdir())
 
 
@@ -375,10 +371,10 @@ def demonstrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
 @pytest.mark.parametrize(
     ("arguments", "name", "written"),
     [
-        ((), "passing.npz", passing(3000)),
-        (("out=other.npz", "num=50", "seed=3"), "other.npz", passing(50, seed=3)),
-        (("kind=social", "num=50"), "social.npz", social(50)),
-        (("kind=social", "out=other.npz", "num=50", "seed=3"), "other.npz", social(50, seed=3)),
+        ((), "swap.npz", swap(3000)),
+        (("task=passing", "out=other.npz", "num=50", "seed=3"), "other.npz", passing(50, seed=3)),
+        (("task=social", "num=50"), "social.npz", social(50)),
+        (("task=social", "out=other.npz", "num=50", "seed=3"), "other.npz", social(50, seed=3)),
     ],
     ids=["defaults", "passing", "social", "social elsewhere"],
 )
@@ -394,7 +390,7 @@ def test_the_command_writes_what_it_says(
 
 def test_the_command_never_overwrites(demonstrations: Run) -> None:
     Path("passing.npz").write_text("precious")
-    code, out, err = demonstrations("num=10")
+    code, out, err = demonstrations("task=passing", "num=10")
     assert (code, out) == (2, "")
     assert err == "conflow: out=passing.npz: File exists, expected a new file in an existing folder\n"
     assert [path.name for path in Path().iterdir()] == ["passing.npz"]
@@ -407,12 +403,15 @@ def test_the_command_never_overwrites(demonstrations: Run) -> None:
         ("out=no/passing.npz", "out=no/passing.npz: No such file or directory, expected a new file in an existing fol"),
         ("out=passing.csv", "out=passing.csv: expected a name that ends in .npz"),
         (f"out={'a' * 300}.npz", f"out={'a' * 300}.npz: File name too long, expected"),
-        ("kind=socal", "kind=socal: expected passing or social; did you mean social?"),
-        ("kind=", "kind=: expected passing or social"),
+        ("task=socal", "task=socal: expected one of passing, social, swap, a file FILE.py; did you mean social?"),
+        ("task=", "task=: expected one of passing, social, swap"),
         ("num=9", "num=9: expected a whole number of at least 10 and at most 100000"),
         ("num=many", "num=many: expected a whole number"),
         ("seed=-1", "seed=-1: expected a whole number of at least 0"),
-        ("sed=1", "sed: no such option, expected kind, out, num, seed; did you mean seed?"),
+        (
+            "sed=1",
+            "sed: no such option, expected task, from, out, num, seed, agents, seconds, T, fps, opposite; did you",
+        ),
         ("passing.npz", "passing.npz: expected key=value"),
     ],
 )
@@ -429,10 +428,11 @@ def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: 
     [
         (
             ("demonstrations", "OUT=a b.npz", "NUM=50", "SEED=3"),
-            ["demonstrations", "kind=passing", "out=a b.npz", "num=50", "seed=3"],
+            ["demonstrations", "task=swap", "out=a b.npz", "num=50", "seed=3"],
         ),
-        (("demonstrations", "KIND=social"), ["demonstrations", "kind=social", "seed=0"]),
-        (("demonstrations",), ["demonstrations", "kind=passing", "seed=0"]),
+        (("demonstrations", "TASK=social"), ["demonstrations", "task=social", "seed=0"]),
+        (("demonstrations", "FROM=a.csv"), ["demonstrations", "from=a.csv", "seed=0"]),
+        (("demonstrations",), ["demonstrations", "task=swap", "seed=0"]),
         (("sample", "OUT=a.npz", "NUM=7"), ["sample", "run=latest", "start=", "goal=", "out=a.npz", "num=7", "seed=0"]),
         (("sample",), ["sample", "run=latest", "start=", "goal=", "seed=0"]),
     ],

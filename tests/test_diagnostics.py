@@ -7,20 +7,23 @@ import pytest
 import torch
 
 from conflow.flow.network import ResMLP
-from conflow.flow.sampler import Solver, integrate
-from conflow.scene.trajectories import swap
+from conflow.flow.sampler import integrate
+from conflow.flow.settings import Solver
+from conflow.scene.measures import smoothness
+from conflow.scene.tasks.swap import swap
 from conflow.training import config
 from conflow.training.build import random_stream
 from conflow.training.diagnostics import by_evaluations, collisions_by_weight, guidance, taken_back
-from conflow.training.metrics import smoothness
-from conflow.training.module import SETTINGS, ConFlow, Setting
+from conflow.training.model import ConFlow
+from conflow.training.module import Training
+from tests.papers import SETTINGS, TWO, model_of
 
 STEPS = 10
 
 
-def model(*arguments: str) -> ConFlow:
+def model(*arguments: str) -> Training:
     torch.manual_seed(0)
-    return ConFlow(config.load(["preset=smoke", *arguments]), 32, 4)
+    return model_of(config.load(["preset=smoke", *arguments]), 32, 4)
 
 
 def constant(velocity: float, *arguments: str) -> ConFlow:
@@ -46,8 +49,8 @@ def test_without_guidance_a_constant_field_only_moves_the_trajectories(gamma: in
     assert (found.start_drift, found.end_drift) == (0, 0)
     # The same distance at all 32 waypoints and all times, and clearances of discs of 0.15 to one of 0.1 at (0, 0.5).
     robots = 32 * -math.log1p(math.exp(-gamma * (0.2 - 0.3))) / gamma
-    assert found.robot_barrier.tolist() == pytest.approx([robots] * (STEPS + 1), rel=1e-4)  # float32
-    for t, value in zip(found.t.tolist(), found.obstacle_barrier.tolist(), strict=True):
+    assert found.barriers["robot"].tolist() == pytest.approx([robots] * (STEPS + 1), rel=1e-4)  # float32
+    for t, value in zip(found.t.tolist(), found.barriers["object"].tolist(), strict=True):
         gap = min(math.dist((x + 0.4 * t, 0.4 * t), (0, 0.5)) for x in (-0.1, 0.1)) - 0.25
         assert value == pytest.approx(32 * -math.log1p(math.exp(-gamma * gap)) / gamma, rel=1e-4)
 
@@ -106,22 +109,22 @@ def test_the_drift_is_how_far_guidance_moves_start_and_goal() -> None:
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_guidance_of_weight_0_does_nothing(setting: Setting) -> None:
+def test_guidance_of_weight_0_does_nothing(setting: str) -> None:
     flow = model("sample.robot_weight=0", "sample.obstacle_weight=0")
     found = guidance(flow, setting, swap(20))
     assert float(found.ratio.max()) == 0
     assert (found.start_drift, found.end_drift) == (0, 0)
-    assert torch.equal(found.robot_barrier, guidance(flow, "none", swap(20)).robot_barrier)
+    assert torch.equal(found.barriers["robot"], guidance(flow, "none", swap(20)).barriers["robot"])
 
 
 @pytest.mark.parametrize("setting", ["robot", "obstacle"])
-def test_collisions_at_a_weight_are_those_of_sampling_with_it(setting: Setting) -> None:
+def test_collisions_at_a_weight_are_those_of_sampling_with_it(setting: str) -> None:
     x_0 = model().source.sample(swap(200)[:, [0, -1]], random_stream("test", 0))
     weights = [0.0, 0.3, 3.0]
     expected = []
     for weight in weights:
         flow = model(f"sample.{setting}_weight={weight}")
-        constraint = flow.robots if setting == "robot" else flow.obstacle
+        constraint = flow.judged["robot"] if setting == "robot" else flow.judged["object"]
         expected.append(int(constraint.violation(flow.flow(x_0, setting)).sum()))
     assert collisions_by_weight(model(), setting, x_0, weights) == expected
     assert expected[0] > expected[-1]
@@ -137,5 +140,5 @@ def test_a_solver_spends_the_evaluations_that_it_was_given(solver: Solver, steps
     assert sum(one.evaluations for one in solved) == len(calls)
     for one, number in zip(solved, steps, strict=True):
         x = integrate(flow.v, x_0, number, solver)
-        assert one.collisions == int(flow.robots.violation(x).sum())
-        assert torch.equal(one.smoothness, smoothness(x))
+        assert one.collisions == int(flow.judged["robot"].violation(x).sum())
+        assert torch.equal(one.smoothness, smoothness(TWO, x))

@@ -11,19 +11,21 @@ from rich.console import Console
 from torch import Tensor
 
 from conflow.scene.constraint import RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
+from conflow.scene.robots import Discs
+from conflow.scene.tasks.swap import swap
 from conflow.training import config, summary
 from conflow.training.datamodule import DemonstrationData, Split
 from conflow.training.evaluation import Evaluation, cycle, evaluate
-from conflow.training.module import SETTINGS, ConFlow
+from conflow.training.model import ConFlow
+from conflow.training.module import Training
 from conflow.training.progress import ProgressDisplay
 from conflow.training.train import trainer
+from tests.papers import SETTINGS, model_of
 
 
-def model() -> ConFlow:
+def model() -> Training:
     torch.manual_seed(0)
-    return ConFlow(config.load(["preset=smoke", "sample.steps=1"]), 32, 4).eval()
+    return model_of(config.load(["preset=smoke", "sample.steps=1"]), 32, 4).eval()
 
 
 def evaluated(demonstrations: Tensor, M: Tensor | None = None) -> Evaluation:
@@ -68,8 +70,8 @@ def test_a_gradient_that_autograd_takes_serves_as_well_as_one_in_closed_form(
     results = []
     for avoidance in (Differentiated, RobotAvoidance):
         torch.manual_seed(0)
-        flow = ConFlow(settings, data.T, data.D)
-        flow.u_c.constraint = avoidance(PointRobots(2))
+        flow = model_of(settings, data.T, data.D)
+        flow.u_c.constraint = avoidance(Discs(2))
         with ProgressDisplay(Console(file=io.StringIO())) as display:
             trainer(settings, cast(Any, Silent()), data, display).fit(flow, data)
             results.append(evaluate(flow.eval(), data.test, display).samples)
@@ -78,7 +80,7 @@ def test_a_gradient_that_autograd_takes_serves_as_well_as_one_in_closed_form(
 
 
 def violates(x: Tensor) -> Tensor:
-    return model().robots.violation(x)
+    return model().judged["robot"].violation(x)
 
 
 def test_every_setting_and_baseline_has_the_guards(evaluation: Evaluation) -> None:
@@ -101,8 +103,8 @@ def test_success_around_the_obstacle_misses_the_obstacle_too(monkeypatch: pytest
     x_1 = cycle(x, 64)
     monkeypatch.setattr(ConFlow, "flow", lambda *_: x_1)
     found = evaluated(x)
-    apart = model().robots.swept_clearance(x_1).amin(dim=1) >= 0
-    free = model().obstacle.swept_clearance(x_1).amin(dim=1) >= 0
+    apart = model().judged["robot"].swept_clearance(x_1).amin(dim=1) >= 0
+    free = model().judged["object"].swept_clearance(x_1).amin(dim=1) >= 0
     succeed = {setting: found.results[setting]["success_count"] for setting in SETTINGS}
     assert succeed == {"none": apart.sum(), "robot": apart.sum(), "obstacle": (apart & free).sum()}
     assert 0 < succeed["obstacle"] < succeed["none"] < 64

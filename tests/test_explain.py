@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from conflow.figures import explain, gallery
-from conflow.figures.explain import Gap, clearing_time, clearing_times, demonstrations
 from conflow.figures.front import DISTANCE, RATE, front
 from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter
@@ -20,11 +19,13 @@ from conflow.results.claims import Claim
 from conflow.results.comparison import Comparison
 from conflow.results.tables import METHODS, Cell
 from conflow.scene.constraint import Barrier
-from conflow.training import config
-from conflow.training.build import build_source, robot_avoidance
+from conflow.training import config, explanation
+from conflow.training.build import build_source
 from conflow.training.closed_form import expected, minimiser, posterior
 from conflow.training.config import Config
+from conflow.training.explanation import Gap, clearing_time, clearing_times, demonstrations
 from tests.conftest import Command
+from tests.papers import label
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def test_the_minimiser_leaves_a_residual_that_no_function_of_x_t_explains(settin
     """The normal equations of least squares: E <phi(x_t), u_t + lambda M u^c(x_t) - v(x_t, t)> = 0 for every phi."""
     nominal = config.load(["data.num=300", "data.jitter=0"])
     x_1 = demonstrations(nominal).double()
-    p_0, constraint = build_source(nominal.source, 32), robot_avoidance(nominal, 4)
+    p_0, constraint = build_source(nominal.source, 32), label(nominal, 4)
     M, u_c, t = constraint.violation(x_1), Correction(constraint, gaussian_filter(32)), 0.4
     v = minimiser(p_0, x_1, M, u_c, 2.5)
     i = torch.randint(300, (4000,), generator=torch.Generator().manual_seed(0))
@@ -77,11 +78,11 @@ def test_the_minimiser_leaves_a_residual_that_no_function_of_x_t_explains(settin
 def test_the_minimiser_without_correction_gives_the_demonstrations_back(monkeypatch: pytest.MonkeyPatch) -> None:
     nominal = config.load(["data.num=200", "data.jitter=0"])
     x_1 = demonstrations(nominal)
-    p_0, constraint = build_source(nominal.source, 32), robot_avoidance(nominal, 4)
+    p_0, constraint = build_source(nominal.source, 32), label(nominal, 4)
     M, u_c = constraint.violation(x_1), Correction(constraint, gaussian_filter(32))
-    monkeypatch.setattr(explain, "SAMPLES", 400)
-    monkeypatch.setattr(explain, "SAMPLE_STEPS", 25)
-    end = explain.sampled(p_0, x_1, minimiser(p_0, x_1, M, u_c, 0.0))[-1]
+    monkeypatch.setattr(explanation, "SAMPLES", 400)
+    monkeypatch.setattr(explanation, "SAMPLE_STEPS", 25)
+    end = explanation.sampled(p_0, x_1, minimiser(p_0, x_1, M, u_c, 0.0))[-1]
     nearest = torch.cdist(end.flatten(1), x_1.double().flatten(1)).amin(dim=1)
     assert nearest.median() < 1e-3
     # As often as they collide: a binomial of 400 has a standard deviation of 0.023.
@@ -90,7 +91,7 @@ def test_the_minimiser_without_correction_gives_the_demonstrations_back(monkeypa
 
 def test_the_papers_loss_minimised_exactly_avoids_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"PAIRS": 400, "SAMPLES": 100, "SAMPLE_STEPS": 40, "WEIGHTS": (0.0, 2.5)}.items():
-        monkeypatch.setattr(explain, name, value)
+        monkeypatch.setattr(explanation if name in vars(explanation) else explain, name, value)
     figure = explain.exact(config.load())
     rates, astray = figure.axes
     assert curve(rates, explain.PAPERS)[0] > 0.2
@@ -124,7 +125,7 @@ def test_in_one_dimension_a_large_weight_leaves_no_collision(gap: Gap) -> None:
 
 def test_gaps_collide_and_are_pushed_as_the_constraint_says(settings: Config, gap: Gap) -> None:
     """The share of D- in g_1, and dg/dt = 2 dC/dc sign(g): both robots give way."""
-    violates = robot_avoidance(settings, 4).violation(demonstrations(settings))
+    violates = label(settings, 4).violation(demonstrations(settings))
     assert gap.collision_rate(gap.g_1) == pytest.approx(float(violates.float().mean()), abs=0.02)
     g = torch.tensor([[-1.0], [-0.2], [0.1], [0.5]])
     slope = Barrier(gamma=settings.constraint.gamma).slope(g.abs() - settings.constraint.radius)
@@ -148,7 +149,7 @@ def test_shifts_in_the_sources_deviations_have_the_cameron_martin_norm(settings:
     inner = u[:, 1:-1]
     expected = (inner * torch.linalg.solve(paper.covariance[1:-1, 1:-1], inner)).sum(dim=1)
     # Sigma's condition number is 1e7.
-    torch.testing.assert_close(explain.in_deviations(paper, u).square().sum(dim=1), expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(explanation.in_deviations(paper, u).square().sum(dim=1), expected, rtol=1e-6, atol=0)
 
 
 def test_the_filters_content_in_trailing_modes_is_orders_of_magnitude_larger(settings: Config) -> None:
@@ -165,7 +166,7 @@ def test_widths_are_those_of_both_kernels(settings: Config) -> None:
     figure = explain.eigenvalues(settings)
     check_labels(figure)
     x = demonstrations(settings)
-    feasible = x[~robot_avoidance(settings, 4).violation(x)]
+    feasible = x[~label(settings, 4).violation(x)]
     floor = settings.source.epsilon**0.5
     for length_scale, sigma_f in ((0.4, 1.0), source.fit_rbf(feasible, source.ENDPOINTS)):
         Sigma = source.cgp(32, length_scale, sigma_f).covariance.numpy()[1:-1, 1:-1]
@@ -202,7 +203,7 @@ def test_the_predicted_end_collides_early_and_x_t_late(settings: Config) -> None
 def test_a_clearing_time_is_inverse_to_the_scale(settings: Config) -> None:
     """And found without stepping over: half the step finds the same to a step."""
     x = demonstrations(settings)[:300]
-    constraint = robot_avoidance(settings, 4)
+    constraint = label(settings, 4)
     x, S = x[constraint.violation(x)], covariant(source.cgp(32).covariance)
     once = clearing_time(Correction(constraint, S), x)
     assert clearing_time(Correction(constraint, 2 * S), x, h=0.005) == pytest.approx(once / 2, abs=0.006)
@@ -214,19 +215,19 @@ def test_a_clearing_time_is_inverse_to_the_scale(settings: Config) -> None:
 def test_lambda_keeps_its_meaning_with_row_sums_alone(settings: Config) -> None:
     """Over T and length scale; each of the four times against a run with that very matrix."""
     few, many, long = (clearing_times(settings, *at) for at in ((16, 0.4), (64, 0.4), (32, 1.6)))
-    assert many[explain.ROW_SUM] == pytest.approx(few[explain.ROW_SUM], rel=0.1)
-    assert long[explain.ROW_SUM] == pytest.approx(few[explain.ROW_SUM], rel=0.15)
-    for name in (explain.PEAKED, explain.SIGMA, explain.FILTERED):
+    assert many[explanation.ROW_SUM] == pytest.approx(few[explanation.ROW_SUM], rel=0.1)
+    assert long[explanation.ROW_SUM] == pytest.approx(few[explanation.ROW_SUM], rel=0.15)
+    for name in (explanation.PEAKED, explanation.SIGMA, explanation.FILTERED):
         assert few[name] > 1.5 * many[name]
-    assert long[explain.SIGMA] > 50 * few[explain.SIGMA]
+    assert long[explanation.SIGMA] > 50 * few[explanation.SIGMA]
 
     x = demonstrations(config.load(["data.num=1000"]))
-    constraint, Sigma = robot_avoidance(settings, 4), source.cgp(32, 1.6).covariance
+    constraint, Sigma = label(settings, 4), source.cgp(32, 1.6).covariance
     x = x[constraint.violation(x)]
     for name, S in (
-        (explain.PEAKED, Sigma / Sigma.max()),
-        (explain.SIGMA, Sigma),
-        (explain.FILTERED, gaussian_filter(32)),
+        (explanation.PEAKED, Sigma / Sigma.max()),
+        (explanation.SIGMA, Sigma),
+        (explanation.FILTERED, gaussian_filter(32)),
     ):
         step = long[name] / 50
         assert clearing_time(Correction(constraint, S), x, step) == pytest.approx(long[name], rel=0.05)
@@ -281,7 +282,7 @@ def published(preset: str, *rates: tuple[str, int, float | None]) -> Comparison:
     for method, count, distance in rates:
         rate = Cell("3", method, RATE, None, count / 1000, None, None, 0, 1, 0, 1, 1, count, 1000, preset, None)
         cells += [rate] if distance is None else [rate, replace(rate, column=DISTANCE, value=distance)]
-    return Comparison(preset, cells, [Claim("", "no runs", None, None, None, "")], {}, {}, "", {}, "", "test", [])
+    return Comparison(preset, cells, [Claim("", "no runs", None, None, None, "")], {}, {}, "", {}, "", "test", [], [])
 
 
 def test_the_front_has_a_point_for_each_method_and_preset() -> None:

@@ -18,21 +18,24 @@ from torch import Tensor
 from conflow.figures import curves, gallery, workspace
 from conflow.figures.animation import animation, frames
 from conflow.flow.sampler import integrate
+from conflow.scene.measures import smoothness
 from conflow.tracking import recording, store
 from conflow.training import config
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.diagnostics import guidance
 from conflow.training.evaluation import Evaluation, cycle
-from conflow.training.metrics import smoothness, wilson
-from conflow.training.module import SETTINGS, ConFlow
+from conflow.training.metrics import wilson
+from conflow.training.model import ConFlow
+from conflow.training.module import Training
 from conflow.training.reload import demonstrations
 from conflow.training.train import experiment
 from tests.conftest import Command
+from tests.papers import SETTINGS, TWO, model_of
 
 
-def model(*arguments: str) -> ConFlow:
+def model(*arguments: str) -> Training:
     torch.manual_seed(0)
-    return ConFlow(config.load(["preset=smoke", *arguments]), 32, 4)
+    return model_of(config.load(["preset=smoke", *arguments]), 32, 4)
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +87,11 @@ def test_demonstrations_are_drawn_apart_by_their_label(data: DemonstrationData) 
 
 def test_a_collision_is_marked_between_the_robots_that_collide() -> None:
     """Of three robots the second and the third, at the waypoint where they are closest."""
-    flow = ConFlow(config.load(["preset=smoke"]), 5, 6)
+    flow = model_of(config.load(["preset=smoke"]), 5, 6)
     x = torch.tensor([-0.9, 0.9, 0.3, 0.0, -0.3, 0.0]).repeat(2, 5, 1)
     x[0, 3] = torch.tensor([-0.9, 0.9, 0.5, 0.2, 0.5, 0.4])
     figure = workspace._workspaces(1, 1)[0]
-    workspace._judged(figure.axes[0], x, flow.robots, "two")
+    workspace._judged(figure.axes[0], x, flow.judged["robot"], "two")
     assert figure.axes[0].get_title() == "two\n1 of 2 (50.0%) collide"
     torch.testing.assert_close(marks(figure.axes[0]), torch.tensor([[0.5, 0.3]]))
 
@@ -106,8 +109,8 @@ def test_the_page_judges_each_setting_by_what_it_avoids(data: DemonstrationData,
     axes = {axis.get_title().split("\n")[0]: axis for axis in workspace.page(flow, data, evaluation, "test").axes}
     for setting in ("none", "robot"):
         count = int((distance(evaluation.samples[setting]).amin(dim=1) < 0.3).sum())
-        assert f"\n{count} of 512 " in axes[workspace.TITLES[setting]].get_title()
-    obstacle = axes[workspace.TITLES["obstacle"]]
+        assert f"\n{count} of 512 " in axes[workspace.titled(setting)].get_title()
+    obstacle = axes[workspace.titled("obstacle")]
     guided, unguided = (
         (evaluation.samples[setting].unflatten(2, (2, 2)) - torch.tensor([0.0, 0.5])).norm(dim=3).amin(dim=(1, 2))
         for setting in ("obstacle", "none")
@@ -125,7 +128,7 @@ def test_the_page_shows_the_demonstrations_of_its_split_and_says_which(
 ) -> None:
     for split, name in config.SPLITS.items():
         figure = workspace.page(model(), data, evaluation, split)
-        assert figure.get_suptitle() == f"cgp, seed 0, preset smoke, {name} split"
+        assert figure.get_suptitle() == f"cgp-s0, preset smoke, {name} split"
         assert figure.axes[0].get_title().startswith(f"{name} demonstrations\n")
         shown = data.held_out[split].x[: workspace.SHOWN].unflatten(2, (2, 2)).transpose(1, 2).flatten(0, 1)
         assert torch.equal(sort(lines(figure.axes[0])), sort(shown))
@@ -145,33 +148,35 @@ def test_the_frames_of_the_flow_are_its_states(evaluation: Evaluation) -> None:
             x = x + flow.v(x, torch.full((512,), k / 10)) / 10
 
 
-def test_the_distances_are_those_between_the_robots(evaluation: Evaluation) -> None:
-    for axis, setting in zip(workspace.distances(model(), evaluation).axes, SETTINGS, strict=True):
+def test_the_clearances_are_the_gaps_between_the_robots(evaluation: Evaluation) -> None:
+    for axis, setting in zip(workspace.clearances(model(), evaluation).axes, SETTINGS, strict=True):
         drawn = torch.tensor(np.array([line.get_ydata() for line in axis.lines if line.get_linestyle() == "-"]))
-        expected = distance(evaluation.samples[setting][: workspace.SHOWN])
+        expected = distance(evaluation.samples[setting][: workspace.SHOWN]) - 0.3
         torch.testing.assert_close(sort(drawn), sort(expected), rtol=0, atol=1e-6)  # float32
-        assert axis.lines[-1].get_ydata() == pytest.approx([0.3, 0.3])
-        assert "workspace units" in axis.get_ylabel() or setting != "none"
+        assert np.array_equal(np.asarray(axis.lines[-1].get_ydata()), [0, 0])
+        assert "clearance" in axis.get_ylabel() or setting != "none"
 
 
 def test_what_counts_as_touching_is_drawn_where_samples_are_judged(
     data: DemonstrationData, evaluation: Evaluation
 ) -> None:
-    """With a radius of their own samples are judged, coloured and drawn by that one, and distances stay distances."""
+    """With a radius of their own samples are judged, coloured and drawn by that one."""
     flow, shown = model("sample.radius=0.2"), evaluation.samples["none"][: workspace.SHOWN]
     nearest = distance(shown).amin(dim=1)
     assert bool(((nearest > 0.2) & (nearest < 0.3)).any())
-    for axis in (workspace.distances(flow, evaluation).axes[0], workspace.page(flow, data, evaluation, "test").axes[5]):
+    for axis in (
+        workspace.clearances(flow, evaluation).axes[0],
+        workspace.page(flow, data, evaluation, "test").axes[5],
+    ):
         drawn = [line for line in axis.lines if line.get_linestyle() == "-"]
         found = torch.tensor(np.array([line.get_ydata() for line in drawn]))
-        torch.testing.assert_close(sort(found), sort(distance(shown)), rtol=0, atol=1e-6)  # float32
+        torch.testing.assert_close(sort(found), sort(distance(shown) - 0.2), rtol=0, atol=1e-6)  # float32
         colliding = torch.tensor([line.get_color() == workspace.COLLISION for line in drawn])
-        assert torch.equal(colliding, found.amin(dim=1) < 0.2)
-        assert axis.lines[-1].get_ydata() == pytest.approx([0.2, 0.2])
-        assert [text.get_text() for text in axis.texts] == ["touching at 0.2"]
+        assert torch.equal(colliding, found.amin(dim=1) < 0)
+        assert np.array_equal(np.asarray(axis.lines[-1].get_ydata()), [0, 0])
     content = json.loads(animation(flow, evaluation, "").split("const content = ")[1].split(";\n")[0])
     # The obstacle is met by the discs that its guidance knows.
-    assert [panel["radius"] for panel in content["scenes"][0]["panels"]] == [0.1, 0.1, 0.15]
+    assert [panel["radii"] for panel in content["scenes"][0]["panels"]] == [[0.1, 0.1], [0.1, 0.1], [0.15, 0.15]]
 
 
 def test_methods_gives_every_run_a_row(evaluation: Evaluation) -> None:
@@ -214,7 +219,7 @@ def test_the_solvers_are_drawn_over_the_evaluations_that_they_spend(evaluation: 
         for i in (0, 3):
             x = integrate(flow.v, x_0, int(evaluations[i]) // each, "euler" if each == 1 else "midpoint")
             assert drawn[i] * 512 == pytest.approx(int((distance(x).amin(dim=1) < 0.3).sum()))
-            assert medians[i] == pytest.approx(float(smoothness(x).quantile(0.5)))
+            assert medians[i] == pytest.approx(float(smoothness(TWO, x).quantile(0.5)))
     assert rates.lines[-1].get_xdata() == pytest.approx([10, 10])  # preset smoke: 10 steps of Euler
 
 
@@ -223,9 +228,9 @@ def test_the_guidance_figure_draws_what_was_measured(evaluation: Evaluation) -> 
     found = {setting: guidance(flow, setting, evaluation.source_samples) for setting in SETTINGS}
     ratio, drift, robots, obstacle = curves.guidance(found).axes
     for setting in SETTINGS:
-        label = curves.LABELS[setting]
-        assert curve(robots, label)[1] == found[setting].robot_barrier.tolist()
-        assert curve(obstacle, label)[1] == found[setting].obstacle_barrier.tolist()
+        label = curves._label(setting)
+        assert curve(robots, label)[1] == found[setting].barriers["robot"].tolist()
+        assert curve(obstacle, label)[1] == found[setting].barriers["object"].tolist()
         if setting != "none":
             assert curve(ratio, label)[1] == found[setting].ratio.tolist()
     heights = [patch.get_height() for patch in drift.patches]  # type: ignore[attr-defined]
@@ -249,7 +254,7 @@ def test_the_animation_needs_nothing_from_outside_and_holds_every_frame(evaluati
         assert bool(collides[i]) == (": collides" in scene["label"])
         for panel, setting in zip(scene["panels"], SETTINGS, strict=True):
             x = evaluation.samples[setting][i]
-            positions, gap = torch.tensor(panel["positions"]), torch.tensor(panel["robotGap"])
+            positions, gap = torch.tensor(panel["positions"]), torch.tensor(panel["keptGap"])
             fill = (len(positions) - 1) // 31
             assert len(positions) == len(gap) == 31 * fill + 1 > 150
             torch.testing.assert_close(positions[::fill].flatten(1), x, rtol=0, atol=6e-5)  # four digits
@@ -267,7 +272,7 @@ def test_frames_go_straight_from_waypoint_to_waypoint() -> None:
 
 def test_colliding_trajectories_are_missing_where_there_are_none(evaluation: Evaluation) -> None:
     flow = model()
-    feasible = ~flow.robots.violation(evaluation.samples["none"])
+    feasible = ~flow.judged["robot"].violation(evaluation.samples["none"])
     apart = Evaluation(
         evaluation.source_samples[feasible], {setting: x[feasible] for setting, x in evaluation.samples.items()}
     )
@@ -286,7 +291,7 @@ def finished(place: Path, monkeypatch: pytest.MonkeyPatch, data: DemonstrationDa
     """A finished run with an untrained model, and with a page that training drew."""
     monkeypatch.chdir(place)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    flow = ConFlow(config.load(["preset=smoke", "seed=77"]), 32, 4)
+    flow = model_of(config.load(["preset=smoke", "seed=77"]), 32, 4)
     checkpoint = {"state_dict": flow.state_dict()}
     flow.on_save_checkpoint(checkpoint)
     torch.save(checkpoint, tmp_path / "model.ckpt")
@@ -308,7 +313,16 @@ def test_all_pictures_are_written_and_logged_and_nothing_else_is_touched(
     gallery.draw(["cgp-s77"], "val", Console(quiet=True))
     written = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert written.pop("mine.txt") == b"kept"
-    pictures = {"demonstrations", "sources", "page", "flow", "distances", "guidance", "solver_steps", "guidance_weight"}
+    pictures = {
+        "demonstrations",
+        "sources",
+        "page",
+        "flow",
+        "clearances",
+        "guidance",
+        "solver_steps",
+        "guidance_weight",
+    }
     pictures.add("taken_back")
     assert written.keys() == {f"{name}.png" for name in pictures} | {"animation.html"}
     assert all(written[f"{name}.png"].startswith(b"\x89PNG") for name in pictures)
@@ -331,7 +345,7 @@ def test_the_pictures_of_the_test_split_take_no_place_of_the_others(
         return sample(flow, x_1)
 
     monkeypatch.setattr(gallery, "sample", watched)
-    data = demonstrations(finished, config.load(["preset=smoke", "seed=77"]))
+    data = demonstrations(finished, model_of(config.load(["preset=smoke", "seed=77"])))
     mine = Path("runs/figures/smoke_cgp-s77/flow.png")
     mine.parent.mkdir(parents=True, exist_ok=True)
     mine.write_text("of the validation split")

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from conflow.grid.local import Cell, _listen, _train_all
+from conflow.grid.local import Job, _look, _train_all
 from conflow.tracking import signals
-from conflow.training import config
+from conflow.training import config, progress
+from conflow.training.progress import ProgressDisplay
 from tests.conftest import raising_signals
 
 GRID = ["ablations", "preset=smoke", "seeds=0", "ablations=cgp fm"]
@@ -35,17 +36,27 @@ def test_a_grid_with_a_mistyped_cell_is_refused_before_any_is_started(argument: 
     assert not (tmp_path / "runs" / "mlflow.db").exists()
 
 
-def test_a_cells_progress_is_read_from_what_it_prints() -> None:
-    cell = Cell([], config.load())
-    for line, share in {
-        "training 100/400  loss 0.1  9 s left": 0.225,
-        "sampling test 2/3  setting robot": 0.9 + 0.1 / 3,
-        "sampling validation 3/3  setting obstacle": 1.0,
-    }.items():
-        _listen(cell, line)
+def test_a_cells_progress_is_what_its_process_says_of_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its stages follow one another: training is 0.9 of the whole, sampling of either split half of the rest."""
+    cell = Job([], config.load(), progress=tmp_path / "progress")
+    _look(cell)
+    assert (cell.share, cell.note) == (0.0, ""), "it has said nothing yet"
+    monkeypatch.setenv(progress.FILE, str(cell.progress))
+    stages = {
+        ("training", 400): (100, 0.225),
+        ("sampling test", 3): (2, 0.9 + 0.1 / 3),
+        ("sampling validation", 3): (3, 1),
+    }
+    for (name, total), (completed, share) in stages.items():
+        monkeypatch.setattr(progress, "FILE_SECONDS", -1.0)
+        with ProgressDisplay(Console(quiet=True)) as display:
+            display.update(display.add(name, total), completed)
+        _look(cell)
         assert cell.share == pytest.approx(share)
-    _listen(cell, "conflow: something else")
-    assert cell.output[-1] == "conflow: something else"
+        assert cell.note == f"{name} {completed}/{total}"
+    (tmp_path / "progress").write_text("train")
+    _look(cell)
+    assert cell.share == 1, "what is being written is read the next time"
 
 
 def test_a_cell_that_was_only_being_started_is_ended_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,7 +73,7 @@ def test_a_cell_that_was_only_being_started_is_ended_too(monkeypatch: pytest.Mon
     with raising_signals():
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
         with pytest.raises(signals.Interrupted, match="SIGTERM"):
-            _train_all([Cell([], config.load())], 1, Console(quiet=True))
+            _train_all([Job([], config.load())], 1, Console(quiet=True))
     assert started[0].returncode == -signal.SIGTERM
 
 
@@ -72,6 +83,6 @@ def test_a_cell_that_cannot_be_started_and_those_after_it_have_failed(monkeypatc
         raise BlockingIOError("Resource temporarily unavailable")
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
-    cells = [Cell([], config.load()) for _ in range(3)]
+    cells = [Job([], config.load()) for _ in range(3)]
     _train_all(cells, 1, Console(quiet=True))
     assert [cell.failed for cell in cells] == [True] * 3

@@ -7,9 +7,10 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from conflow.scene.constraint import Obstacle, ObstacleAvoidance, RobotAvoidance, Sum
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
+from conflow.scene.constraint import Sum
+from conflow.scene.measures import endpoint_error, path_length, peak_acceleration, smoothness, squared_acceleration
+from conflow.scene.settings import Obstacle
+from conflow.scene.tasks.swap import swap
 from conflow.training import metrics as metrics_module
 from conflow.training.metrics import (
     CollisionRate,
@@ -22,18 +23,14 @@ from conflow.training.metrics import (
     Smoothness,
     SuccessRate,
     SweptCollisionRate,
-    endpoint_error,
-    path_length,
-    peak_acceleration,
     quantile_interval,
-    smoothness,
-    squared_acceleration,
     trajectory_metrics,
     wilson,
 )
+from tests.papers import TWO, keep_apart, keep_clear
 
-ROBOTS = RobotAvoidance(PointRobots(2), 0.3)
-OBSTACLE = ObstacleAvoidance(PointRobots(2), [Obstacle(0.0, 0.5, 0.1)], 0.15)
+ROBOTS = keep_apart(2, 0.3)
+OBSTACLE = keep_clear(2, [Obstacle(0.0, 0.5, 0.1)], 0.15)
 
 
 def parallel(gap: float, T: int = 5) -> Tensor:
@@ -94,22 +91,22 @@ def test_a_crossing_between_two_waypoints_is_a_swept_collision_alone() -> None:
 
 
 def test_smoothness_of_constant_speed_is_zero_and_of_a_parabola_its_acceleration() -> None:
-    assert smoothness(parallel(0.4)).item() == pytest.approx(0, abs=1e-7)
+    assert smoothness(TWO, parallel(0.4)).item() == pytest.approx(0, abs=1e-7)
     s = torch.arange(6.0)
     x = torch.zeros(1, 6, 4)
     x[0, :, 0], x[0, :, 1] = 0.03 * s**2, 0.04 * s**2  # second difference (0.06, 0.08), of norm 0.1
-    assert smoothness(x).item() == pytest.approx(0.05)  # the other robot stands still
-    assert peak_acceleration(x).item() == pytest.approx(0.05)
-    assert squared_acceleration(x).item() == pytest.approx(0.005)
+    assert smoothness(TWO, x).item() == pytest.approx(0.05)  # the other robot stands still
+    assert peak_acceleration(TWO, x).item() == pytest.approx(0.05)
+    assert squared_acceleration(TWO, x).item() == pytest.approx(0.005)
 
 
 def test_a_single_kink_shows_in_full_in_the_peak_and_diluted_in_the_mean() -> None:
     """Positions 0, 0, 0, 1, 2, 3 of one robot: one second difference of 1 among four, the other robot stands still."""
     x = torch.zeros(1, 6, 4)
     x[0, :, 0] = torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0])
-    assert smoothness(x).item() == pytest.approx(1 / 8)
-    assert peak_acceleration(x).item() == pytest.approx(1 / 2)
-    assert squared_acceleration(x).item() == pytest.approx(1 / 8)
+    assert smoothness(TWO, x).item() == pytest.approx(1 / 8)
+    assert peak_acceleration(TWO, x).item() == pytest.approx(1 / 2)
+    assert squared_acceleration(TWO, x).item() == pytest.approx(1 / 8)
 
 
 def test_endpoint_errors_are_distances_per_robot() -> None:
@@ -117,8 +114,8 @@ def test_endpoint_errors_are_distances_per_robot() -> None:
     x = x_1.clone()
     x[0, 0, :2] += torch.tensor([0.03, 0.04])
     x[0, -1, 2:] += torch.tensor([0.0, 0.2])
-    assert endpoint_error(x, x_1, 0).item() == pytest.approx(0.025)
-    assert endpoint_error(x, x_1, -1).item() == pytest.approx(0.1)
+    assert endpoint_error(TWO, x, x_1, 0).item() == pytest.approx(0.025)
+    assert endpoint_error(TWO, x, x_1, -1).item() == pytest.approx(0.1)
 
 
 def test_diversity_of_two_trajectories_is_their_distance_and_of_copies_zero() -> None:
@@ -131,16 +128,16 @@ def test_diversity_of_two_trajectories_is_their_distance_and_of_copies_zero() ->
 
 
 def test_path_lengths_of_a_straight_line_a_half_circle_and_a_robot_that_stands_still() -> None:
-    assert path_length(parallel(0.4)).item() == pytest.approx(1)
+    assert path_length(TWO, parallel(0.4)).item() == pytest.approx(1)
     T = 40
     angle = torch.linspace(0, math.pi, T)
     x = torch.zeros(1, T, 4)
     x[0, :, 0], x[0, :, 1] = 0.5 * angle.cos(), 0.5 * angle.sin()
     # Chords of the half circle of radius 1/2, whose arc is pi/2; the other robot stands still.
     chords = (T - 1) * math.sin(math.pi / 2 / (T - 1))
-    assert path_length(x).item() == pytest.approx(chords / 2, rel=1e-5)
-    assert path_length(x).item() == pytest.approx(math.pi / 4, rel=1e-3)
-    metric = PathLength()
+    assert path_length(TWO, x).item() == pytest.approx(chords / 2, rel=1e-5)
+    assert path_length(TWO, x).item() == pytest.approx(math.pi / 4, rel=1e-3)
+    metric = PathLength(TWO)
     metric.update(torch.cat([x, parallel(0.4, T), x]))
     result = metric.compute()
     assert result["path_length_median"] == pytest.approx(chords / 2, rel=1e-5)
@@ -207,13 +204,16 @@ def test_success_takes_all_of_it(spoil: Callable[[Tensor], None], count: int) ->
 def test_no_trajectory_both_succeeds_around_the_obstacle_and_hits_it() -> None:
     """What succeeds with the obstacle to keep succeeds without it and never touches it on its straight lines."""
     x = swap(300, seed=1)
-    alone, around = (trajectory_metrics(ROBOTS, OBSTACLE, None, kept) for kept in (ROBOTS, Sum([ROBOTS, OBSTACLE])))
+    alone, around = (
+        trajectory_metrics({"robot": ROBOTS, "object": OBSTACLE}, ROBOTS, None, kept)
+        for kept in (ROBOTS, Sum([ROBOTS, OBSTACLE]))
+    )
     free = OBSTACLE.swept_clearance(x).amin(dim=1) >= 0
     for each in (alone, around):
         each.update(x=x, x_1=x)
     found = around.compute()
     assert found["success_rate"] + found["object_collision_rate"] <= 1
-    apart = trajectory_metrics(ROBOTS, OBSTACLE, None, ROBOTS)
+    apart = trajectory_metrics({"robot": ROBOTS, "object": OBSTACLE}, ROBOTS, None, ROBOTS)
     apart.update(x=x[free], x_1=x[free])
     assert found["success_count"] == apart.compute()["success_count"]
     assert 0 < found["success_count"] < alone.compute()["success_count"]
@@ -286,7 +286,7 @@ def test_the_intervals_of_means_cover_them(name: str) -> None:
     covered = []
     for _ in range(400):
         x = torch.randn(200, 1, 2, generator=generator)
-        metric = Diversity() if name == "diversity" else EndpointError(name, 0)
+        metric = Diversity() if name == "diversity" else EndpointError(TWO, name, 0)
         metric.update(x) if isinstance(metric, Diversity) else metric.update(x, torch.zeros_like(x))
         result = metric.compute()
         covered.append(result[f"{name}_low"] <= truth <= result[f"{name}_high"])
@@ -304,7 +304,7 @@ def test_the_energy_distance_grows_with_a_shift() -> None:
 def test_intervals_enclose_their_estimates_and_shrink_with_the_root_of_the_count() -> None:
     spreads = []
     for num in (400, 6400):
-        metrics = [Smoothness(), EndpointError("start_error", 0), Diversity()]
+        metrics = [Smoothness(TWO), EndpointError(TWO, "start_error", 0), Diversity()]
         x, x_1 = swap(num, seed=1), swap(num, seed=2)
         results: dict[str, float] = {}
         for metric in metrics:
@@ -320,7 +320,9 @@ def test_intervals_enclose_their_estimates_and_shrink_with_the_root_of_the_count
 def test_metrics_do_not_depend_on_how_the_trajectories_were_split_over_batches() -> None:
     x, x_1 = swap(300, seed=1), swap(300, seed=2)
     reference = swap(200, seed=3)
-    whole, parts = (trajectory_metrics(ROBOTS, OBSTACLE, reference, ROBOTS) for _ in range(2))
+    whole, parts = (
+        trajectory_metrics({"robot": ROBOTS, "object": OBSTACLE}, ROBOTS, reference, ROBOTS) for _ in range(2)
+    )
     whole.update(x=x, x_1=x_1)
     for a, b in zip(x.split([1, 99, 200]), x_1.split([1, 99, 200]), strict=True):
         parts.update(x=a, x_1=b)
@@ -332,7 +334,9 @@ def test_metrics_do_not_depend_on_how_the_trajectories_were_split_over_batches()
 
 def test_without_a_reference_there_is_no_energy_distance_and_all_else() -> None:
     x = swap(50, seed=1)
-    without, with_one = (trajectory_metrics(ROBOTS, OBSTACLE, reference, ROBOTS) for reference in (None, x))
+    without, with_one = (
+        trajectory_metrics({"robot": ROBOTS, "object": OBSTACLE}, ROBOTS, reference, ROBOTS) for reference in (None, x)
+    )
     for each in (without, with_one):
         each.update(x=x, x_1=x)
     left_out = with_one.compute().keys() - without.compute().keys()

@@ -7,18 +7,20 @@ from conflow.flow.network import SpectralMLP
 from conflow.flow.path import guided_path, interpolate
 from conflow.flow.sampler import PIECE, integrate
 from conflow.flow.source import ENDPOINTS, fit_rbf
-from conflow.scene.trajectories import swap
+from conflow.scene.measures import smoothness
+from conflow.scene.tasks.swap import swap
 from conflow.training import config
 from conflow.training.build import fitted, random_stream
 from conflow.training.config import Config
 from conflow.training.datamodule import DemonstrationData
-from conflow.training.metrics import smoothness
-from conflow.training.module import SETTINGS, ConFlow, Setting, start_and_goal
+from conflow.training.model import start_and_goal
+from conflow.training.module import Training
+from tests.papers import SETTINGS, TWO, model_of
 
 
-def model(*arguments: str) -> ConFlow:
+def model(*arguments: str) -> Training:
     torch.manual_seed(0)
-    return ConFlow(config.load(["preset=smoke", *arguments]), 32, 4)
+    return model_of(config.load(["preset=smoke", *arguments]), 32, 4)
 
 
 def closest(x: Tensor) -> Tensor:
@@ -84,14 +86,16 @@ def test_guidance_moves_samples_away_from_what_it_avoids_and_in_proportion_to_it
         torch.nn.init.zeros_(flow.v.outlet.bias)
     clearance = {
         name: [
-            flow.robots.clearance(flow.sample(x_1, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
+            flow.judged["robot"].clearance(flow.sample(x_1, setting, noise())).amin(dim=1).mean().item()
+            for setting in SETTINGS
         ]
         for name, flow in (("base", base), ("strong", strong))
     }
     none, robot, _ = clearance["base"]
     assert none < robot < clearance["strong"][1]
     obstacle = [
-        base.obstacle.clearance(base.sample(x_1, setting, noise())).amin(dim=1).mean().item() for setting in SETTINGS
+        base.judged["object"].clearance(base.sample(x_1, setting, noise())).amin(dim=1).mean().item()
+        for setting in SETTINGS
     ]
     assert obstacle[2] > obstacle[0]
 
@@ -121,7 +125,7 @@ def test_a_network_that_sees_the_ends_asks_for_them_and_uses_them(kind: str) -> 
 def test_samples_may_be_judged_at_another_distance_than_they_were_trained_for() -> None:
     """The label M, the barrier and the network keep the constraint's radius."""
     here, x = model("sample.radius=0.25"), swap(500)
-    assert torch.equal(here.robots.violation(x), closest(x) < 0.25)
+    assert torch.equal(here.judged["robot"].violation(x), closest(x) < 0.25)
     assert torch.equal(here.u_c(x), model().u_c(x))
     assert torch.equal(DemonstrationData(here.config).violates, DemonstrationData(model().config).violates)
 
@@ -135,7 +139,9 @@ def test_a_correction_may_leave_alone_what_the_source_fixes() -> None:
 def test_samples_start_as_smooth_as_the_source() -> None:
     gaussian, cgp = (model(f"source.kind={kind}") for kind in ("gaussian", "cgp"))
     x = swap(100)
-    rough, smooth = (smoothness(flow.source.sample(flow.source.observe(x), noise())).mean() for flow in (gaussian, cgp))
+    rough, smooth = (
+        smoothness(TWO, flow.source.sample(flow.source.observe(x), noise())).mean() for flow in (gaussian, cgp)
+    )
     assert smooth < 0.1 * rough
 
 
@@ -146,7 +152,7 @@ def test_a_fitted_kernel_comes_from_the_demonstrations_and_survives_reloading() 
     length_scale, sigma_f = fit_rbf(x, ENDPOINTS, settings.source.epsilon)
     assert (fitting.source.length_scale, fitting.source.sigma_f) == (length_scale, sigma_f)
     assert fitting.source.length_scale != settings.source.length_scale
-    one, again = ConFlow(fitting, 32, 4), ConFlow(config.from_tree(fitting.tree()), 32, 4)
+    one, again = model_of(fitting, 32, 4), model_of(config.from_tree(fitting.tree()), 32, 4)
     again.load_state_dict(one.state_dict())
     assert torch.equal(one.sample(x, "none", noise()), again.sample(x, "none", noise()))
 
@@ -156,7 +162,7 @@ def test_without_fit_the_kernel_stays_as_it_is_set(smoke: Config) -> None:
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_samples_do_not_depend_on_how_many_are_asked_for(setting: Setting) -> None:
+def test_samples_do_not_depend_on_how_many_are_asked_for(setting: str) -> None:
     """Nor does what the network sees at a time grow with them; the same again is the same to the last bit."""
     flow = model("network.sees_ends=true", "sample.steps=2")
     seen: list[int] = []
@@ -256,7 +262,7 @@ def test_the_guided_loss_regresses_the_velocity_of_the_guided_path() -> None:
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: Setting) -> None:
+def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: str) -> None:
     x_1 = swap(200)
     flow = model("ablation=plus", "source.fit=false")
     flow.fit(x_1)

@@ -7,9 +7,8 @@ from torch import nn
 from conflow.flow.network import SEEN, ResidualBlock, ResMLP, SpectralMLP
 from conflow.flow.sampler import integrate
 from conflow.flow.source import ENDPOINTS, Source, rbf
-from conflow.scene.constraint import RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
+from tests.papers import keep_apart
 
 
 def network() -> ResMLP:
@@ -69,7 +68,7 @@ def test_the_papers_network_has_the_papers_size() -> None:
 def spectral(modes: int = 8) -> tuple[SpectralMLP, Source]:
     torch.manual_seed(0)
     source = Source(rbf(32, 0.4, 1.0, 1e-6), ENDPOINTS, modes=modes)
-    v = SpectralMLP(source, 4, RobotAvoidance(PointRobots(2)), hidden=32, blocks=1)
+    v = SpectralMLP(source, 4, keep_apart(2), hidden=32, blocks=1)
     nn.init.normal_(v.outlet.weight, std=0.3)
     return v, source
 

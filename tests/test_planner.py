@@ -17,13 +17,13 @@ from conflow import __main__ as command_line
 from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
 from conflow.planner import PlanError, Planner, Plans, _ranked, exact
-from conflow.scene.constraint import Obstacle, RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
+from conflow.scene.settings import Obstacle
+from conflow.scene.tasks.swap import swap
 from conflow.tracking import signals, store
 from conflow.training import config
 from conflow.training.build import fitted, random_stream
-from conflow.training.module import ConFlow
+from conflow.training.model import ConFlow
+from tests.papers import keep_apart, model_of
 
 T, D = 32, 4
 START, GOAL = (-0.8, 0.0, 0.8, 0.0), (0.8, 0.0, -0.8, 0.0)
@@ -43,7 +43,7 @@ def one_thread() -> Iterator[None]:
 
 def planner(*arguments: str, still: bool = False) -> Planner:
     torch.manual_seed(0)
-    model = ConFlow(config.load(["preset=smoke", *arguments]), T, D)
+    model = model_of(config.load(["preset=smoke", *arguments]), T, D)
     if still:
         torch.nn.init.zeros_(model.v.outlet.weight)
         torch.nn.init.zeros_(model.v.outlet.bias)
@@ -52,7 +52,7 @@ def planner(*arguments: str, still: bool = False) -> Planner:
 
 def save(model: ConFlow, path: Path) -> Path:
     """What of a run's checkpoint is read."""
-    described = {"config": model.config.tree(), "T": model.T, "D": model.D}
+    described = {"config": model.config.tree(), "T": model.T, "D": model.D, "scale": 1.0, "offset": 0.0}
     torch.save({"conflow": described, "state_dict": model.state_dict()}, path)
     return path
 
@@ -71,7 +71,7 @@ def clearance(x: Tensor, obstacles: list[tuple[float, float, float]], radius: fl
 
 
 @pytest.mark.parametrize("kind", SOURCES)
-@pytest.mark.parametrize("guidance", ["none", "both"])
+@pytest.mark.parametrize("guidance", ["none", "all"])
 def test_start_goal_and_via_points_are_met_to_the_last_bit(kind: str, guidance: Any) -> None:
     pairs = swap(3)
     starts, goals = pairs[:, 0].double() / 3 * 3, pairs[:, -1]
@@ -136,7 +136,7 @@ def test_feasible_plans_come_first_and_smoother_ones_before_rougher_ones() -> No
 def test_robots_that_pass_through_each_other_between_two_waypoints_are_not_feasible() -> None:
     """At every waypoint they are apart, on the way they are not."""
     through = torch.tensor([[[-0.6, 0.0, 0.6, 0.0], [-0.2, 0.0, 0.2, 0.0], [0.2, 0.0, -0.2, 0.0]]])
-    plans = _ranked(through[None], RobotAvoidance(PointRobots(2), 0.3))
+    plans = _ranked(through[None], keep_apart(2, 0.3))
     assert not bool(plans.feasible.any())
     assert plans.clearance.item() == pytest.approx(-0.3)
 
@@ -207,7 +207,7 @@ def test_guidance_moves_plans_away_from_what_it_avoids_and_in_proportion_to_its_
     ]
     assert obstacles[0] < obstacles[1] < obstacles[2]
     assert flow.model.config.sample.obstacle_weight == 1
-    both = plan(guidance="both", obstacles=discs, robot_weight=3, obstacle_weight=3)
+    both = plan(guidance="all", obstacles=discs, robot_weight=3, obstacle_weight=3)
     assert both.clearance.mean() > obstacles[2]
 
 
@@ -227,7 +227,7 @@ def test_guidance_is_around_robots_always_and_around_obstacles_where_there_are_s
     flow = planner(still=True)
     assert torch.equal(flow.plan(START, GOAL, 9).x, flow.plan(START, GOAL, 9, guidance="robot").x)
     default = flow.plan(START, GOAL, 9, [Obstacle()])
-    assert torch.equal(default.x, flow.plan(START, GOAL, 9, [Obstacle()], guidance="both").x)
+    assert torch.equal(default.x, flow.plan(START, GOAL, 9, [Obstacle()], guidance="all").x)
     parts: tuple[Any, ...] = ("robot", "obstacle")
     assert all(not torch.equal(default.x, flow.plan(START, GOAL, 9, [Obstacle()], guidance=part).x) for part in parts)
     unguided = flow.plan(START, GOAL, 9, [Obstacle()], guidance="none")
@@ -257,8 +257,8 @@ REQUEST: dict[str, Any] = {"start": START, "goal": GOAL, "num": 2}
         ({"start": (-1.2, 0, 0.8, 0)}, r"start=\(-1.2, 0, 0.8, 0\): expected finite .* workspace \[-1, 1\]"),
         ({"goal": (0.8, 0, NAN, 0)}, r"goal=\(0.8, 0, nan, 0\): expected finite"),
         ({"goal": (0.8, 0, -INF, 0)}, r"goal=.*-inf.*expected finite"),
-        ({"start": (0, 0, 0.2, 0)}, r"start=\(0, 0, 0.2, 0\): in collision with another robot"),
-        ({"goal": (0.5, 0.5, 0.5, 0.5)}, r"goal=.*in collision with another robot"),
+        ({"start": (0, 0, 0.2, 0)}, r"start=\(0, 0, 0.2, 0\): violates robot by 0.1 between robots 1 and 2"),
+        ({"goal": (0.5, 0.5, 0.5, 0.5)}, r"goal=.*violates robot by 0.3"),
         ({"start": (0.8, 0)}, r"start=\(0.8, 0\): found shape \(2,\), expected numbers of shape \(4,\) or \(B, 4\)"),
         ({"start": 0.8}, r"start=0.8: found shape \(\), expected"),
         ({"start": np.zeros((1, 1, 4))}, r"start=.*found shape \(1, 1, 4\)"),
@@ -271,13 +271,13 @@ REQUEST: dict[str, Any] = {"start": START, "goal": GOAL, "num": 2}
         ({"start": [START, START]}, r"goal: found shape \(4,\), expected that of start, \(2, 4\)"),
         ({"start": [START] * 3, "goal": [GOAL] * 2}, r"goal: found shape \(2, 4\), expected .* \(3, 4\)"),
         ({"start": [START, (0, 0, 0, 2)], "goal": [GOAL] * 2}, r"start\[1\]=\(0, 0, 0, 2\): expected finite"),
-        ({"start": [START] * 2, "goal": [GOAL, (0, 0, 0, 0)]}, r"goal\[1\]=\(0, 0, 0, 0\): in collision"),
+        ({"start": [START] * 2, "goal": [GOAL, (0, 0, 0, 0)]}, r"goal\[1\]=\(0, 0, 0, 0\): violates robot by 0.3"),
         ({"num": 0}, r"num=0: expected a whole number of at least 1"),
         ({"num": 2.0}, r"num=2.0: expected a whole number"),
         ({"num": True}, r"num=True: expected a whole number"),
         ({"seed": 0.5}, r"seed=0.5: expected a whole number of at least 0"),
-        ({"obstacles": [(-0.8, 0.1, 0.1)]}, r"start=.*in collision with obstacles\[0\]"),
-        ({"obstacles": [Obstacle(), Obstacle(0.8, 0.2, 0.1)]}, r"start=.*in collision with obstacles\[1\]"),
+        ({"obstacles": [(-0.8, 0.1, 0.1)]}, r"start=.*violates obstacles\[0\] by 0.15 at robot 1"),
+        ({"obstacles": [Obstacle(), Obstacle(0.8, 0.2, 0.1)]}, r"start=.*violates obstacles\[1\] by 0.05 at robot 2"),
         ({"obstacles": [(0.4, 0.5, 0)]}, r"obstacles\[0\]=\(0.4, 0.5, 0\): .* radius above 0"),
         ({"obstacles": [(0.4, 0.5, -0.1)]}, r"obstacles\[0\]=.* radius above 0"),
         ({"obstacles": [Obstacle(), Obstacle(0, 0, NAN)]}, r"obstacles\[1\]=\(0, 0, nan\): expected finite"),
@@ -292,11 +292,11 @@ REQUEST: dict[str, Any] = {"start": START, "goal": GOAL, "num": 2}
         ({"via": [(0.5, (0, 0, 0, 0.5)), (0.51, START)]}, r"via\[1\]: s=0.51 falls on waypoint 16 of 32 as via\[0\]"),
         ({"via": [(0.5, (0, 0, 0, 1.5))]}, r"via\[0\]=\(0, 0, 0, 1.5\): expected finite"),
         ({"via": [(0.5, [START])]}, r"via\[0\]=.*found shape \(1, 4\), expected numbers of shape \(4,\)$"),
-        ({"via": [(0.5, (0, 0, 0, 0.1))]}, r"via\[0\]=\(0, 0, 0, 0.1\): in collision with another robot"),
-        ({"via": [(0.3, (0, 0, 0, 0.5))], "obstacles": [Obstacle()]}, r"via\[0\]=.*in collision with obstacles\[0\]"),
+        ({"via": [(0.5, (0, 0, 0, 0.1))]}, r"via\[0\]=\(0, 0, 0, 0.1\): violates robot by 0.2 between robots 1 and 2"),
+        ({"via": [(0.3, (0, 0, 0, 0.5))], "obstacles": [Obstacle()]}, r"via\[0\]=.*violates obstacles\[0\] by 0.25"),
         ({"via": [0.5]}, r"via\[0\]=0.5: expected \(s, position\)"),
         ({"via": 0.5}, r"via=0.5: expected a sequence"),
-        ({"guidance": "robots"}, r"guidance=robots: expected one of none, robot, obstacle, both; did you mean robot\?"),
+        ({"guidance": "robots"}, r"guidance=robots: expected one of none, all, robot, obstacle; did you mean robot\?"),
         ({"guidance": 0.08}, r"guidance=0.08: expected one of"),
         ({"guidance": "obstacle"}, r"guidance=obstacle: expected obstacles to guide around, found none"),
         ({"robot_weight": -1}, r"robot_weight=-1: expected a finite number of at least 0"),
@@ -319,7 +319,7 @@ def test_a_checkpoint_plans_as_the_model_that_was_saved(kind: str, tmp_path: Pat
 
 
 def test_a_fitted_source_is_conditioned_on_via_points_with_its_own_kernel(tmp_path: Path) -> None:
-    model = ConFlow(fitted(config.load(["preset=smoke", "source.fit=true"]), swap(100)), T, D)
+    model = model_of(fitted(config.load(["preset=smoke", "source.fit=true"]), swap(100)), T, D)
     loaded = Planner.load(save(model, tmp_path / "model.ckpt"))
     assert not torch.equal(loaded.model.source.prior, rbf(T, 0.4, 1.0, 1e-6))
     assert torch.equal(
@@ -350,7 +350,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_in_one_line_and_never_executed(
     torch.save({"conflow": Trap(tmp_path / "sprung")}, tmp_path / "trap.ckpt")
     torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
     torch.save([1, 2], tmp_path / "list.ckpt")
-    described = {"config": planner().model.config.tree(), "T": T, "D": D}
+    described = {"config": planner().model.config.tree(), "T": T, "D": D, "scale": 1.0, "offset": 0.0}
     torch.save({"conflow": described, "state_dict": {}}, tmp_path / "weightless.ckpt")
     (tmp_path / "folder.ckpt").mkdir()
     for name in (*contents, "trap", "foreign", "list", "weightless", "folder"):
@@ -436,7 +436,7 @@ def test_the_command_writes_plans_and_picture_and_says_how_many_are_feasible(
     p, n, z = count / 40, 40, 1.959964
     low, high = ((p + z**2 / 80 + s * z * math.sqrt(p * (1 - p) / n + z**2 / 6400)) / (1 + z**2 / n) for s in (-1, 1))
     assert out == (
-        f"{count} of 40 plans are feasible, {p:.1%} (95 % interval {low:.1%} to {high:.1%}); "
+        f"Run smoke/cgp-s0: {count} of 40 plans are feasible, {p:.1%} (95 % interval {low:.1%} to {high:.1%}); "
         f"best clearance {expected.clearance.max():.3f}\nWritten: plans.npz and plans.png\n"
     )
 
@@ -463,7 +463,7 @@ def test_the_command_never_overwrites(existing: str, conflow_sample: Run) -> Non
         ((*PAIR, "obstacle=0,0.5"), r"obstacles\[0\]=\[0.0, 0.5\]: found shape \(2,\), expected .*radius"),
         ((*PAIR, "num=0"), "num=0: expected a whole number of at least 1"),
         ((*PAIR, "seed=-1"), "seed=-1: expected a whole number of at least 0"),
-        ((*PAIR, "guidance=booth"), r"guidance=booth: expected one of .*did you mean both\?"),
+        ((*PAIR, "guidance=robbot"), r"guidance=robbot: expected one of .*did you mean robot\?"),
         ((*PAIR, "out=plans.csv"), "out=plans.csv: expected a name that ends in .npz"),
         ((*PAIR, "out=no/plans.npz"), "out=no/plans.npz: expected an existing folder, found no no"),
         ((*PAIR, "run=./none.ckpt"), "run=./none.ckpt: no such file"),

@@ -12,9 +12,9 @@ from torchdiffeq import odeint
 from conflow.flow.correction import Correction, gaussian_filter
 from conflow.flow.network import ResMLP
 from conflow.flow.path import end
-from conflow.flow.sampler import Field, Solver, descended, guided, guided_ahead, integrate, states
-from conflow.scene.constraint import RobotAvoidance
-from conflow.scene.robots import PointRobots
+from conflow.flow.sampler import Field, descended, guided, guided_ahead, integrate, states
+from conflow.flow.settings import Solver
+from tests.papers import keep_apart
 
 SOLVERS: tuple[Solver, ...] = get_args(Solver)
 
@@ -174,7 +174,7 @@ def test_sampling_needs_no_autograd(solver: Solver, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(Tensor, "backward", refuse)
     torch.manual_seed(0)
     v = ResMLP(8, 4, hidden=16, blocks=1)
-    correction = Correction(RobotAvoidance(PointRobots(2)), gaussian_filter(8))
+    correction = Correction(keep_apart(2), gaussian_filter(8))
     x_0 = initial(torch.float32)
     free, pushed = integrate(v, x_0, 5, solver), integrate(guided(v, correction), x_0, 5, solver)
     assert not pushed.requires_grad

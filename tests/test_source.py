@@ -13,7 +13,9 @@ from torch import Tensor
 from conflow.flow import source
 from conflow.flow.correction import gaussian_filter
 from conflow.flow.source import ENDPOINTS, Source, fit_rbf, rbf
-from conflow.scene.trajectories import passing, social, swap
+from conflow.scene.tasks.passing import passing
+from conflow.scene.tasks.social import social
+from conflow.scene.tasks.swap import swap
 
 T, D = 8, 2
 

@@ -16,9 +16,9 @@ from rich.console import Console
 from sqlalchemy import Engine, event
 
 from conflow import errors
-from conflow.grid.local import Cell, _finished
+from conflow.grid.local import Job, _finished
 from conflow.results.records import Record
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
 from conflow.tracking import code, liveness, recording, resume, signals, store
 from conflow.training import config
 from conflow.training.datamodule import DemonstrationData
@@ -386,7 +386,7 @@ def test_a_grid_knows_its_cells_by_their_code_too(
     store.client().set_terminated(run.info.run_id, status)
 
     def seen(any_code: bool) -> tuple[bool, list[str], str]:
-        cell = Cell([], data.config)
+        cell = Job([], data.config)
         return _finished(cell, any_code), cell.arguments, cell.again
 
     again = [f"resume={run.info.run_id}"]
@@ -404,9 +404,9 @@ def test_labels_that_are_inverted_in_the_file_make_another_cell(store_folder: Pa
     settings = config.load(["preset=smoke", "data.path=mine.npz"])
     with recording.start(experiment(settings, DemonstrationData(settings))):
         pass
-    assert _finished(Cell([], settings), any_code=False)
+    assert _finished(Job([], settings), any_code=False)
     np.savez("mine.npz", x=x, violates=~labels)
-    assert not _finished(Cell([], settings), any_code=False)
+    assert not _finished(Job([], settings), any_code=False)
 
 
 def other_correction() -> Callable[[], Mapping[str, str]]:

@@ -11,9 +11,10 @@ from conflow.training import config
 from conflow.training.build import random_stream
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.metrics import trajectory_metrics
-from conflow.training.module import SETTINGS
-from conflow.training.reload import demonstrations, load_model
+from conflow.training.model_file import load_model
+from conflow.training.reload import demonstrations
 from tests.conftest import Command
+from tests.papers import SETTINGS, model_of
 
 SETTINGS_ARGUMENTS = ["preset=smoke", "seed=3"]
 
@@ -112,10 +113,10 @@ def test_a_reloaded_model_samples_what_the_run_was_measured_on(
     run, _ = trained
     model = load_model(artifacts(run) / "model.ckpt")
     held_out = DemonstrationData(model.config).held_out[split].x
-    x_1, reference = held_out[torch.arange(64) % 50], held_out[~model.robots.violation(held_out)]
+    x_1, reference = held_out[torch.arange(64) % 50], held_out[~model.judged["robot"].violation(held_out)]
     for setting in SETTINGS:
         x = model.sample(x_1, setting, random_stream(f"{split} samples", 3))
-        metrics = trajectory_metrics(model.robots, model.obstacle, reference, model.required(setting))
+        metrics = trajectory_metrics(model.judged, model.trained, reference, model.required(setting))
         metrics.update(x=x, x_1=x_1)
         for key, value in metrics.compute().items():
             # To the bit but for the order of sums: training and test may run on other numbers of threads.
@@ -162,7 +163,7 @@ def test_evaluating_again_adds_to_the_run_and_changes_nothing_that_it_had(
     x_1 = DemonstrationData(model.config).held_out[split].x[torch.arange(64) % 50]
     x = model.sample(x_1, "robot", random_stream(f"{split} samples", 8))
     counted = after.data.metrics[f"{prefix}/robot/robot_collision_count"]
-    assert counted == model.robots.violation(x).sum()
+    assert counted == model.judged["robot"].violation(x).sum()
     assert (artifacts(before) / f"{prefix}.yaml").exists()
 
 
@@ -185,6 +186,6 @@ def test_what_a_finished_run_cannot_be_asked_is_refused(
 
 def test_a_run_is_not_judged_on_data_that_have_changed_since(trained: tuple[Run, str]) -> None:
     run, _ = trained
-    assert demonstrations(run, config.load(SETTINGS_ARGUMENTS)).digest == run.data.tags["data_digest"]
+    assert demonstrations(run, model_of(config.load(SETTINGS_ARGUMENTS))).digest == run.data.tags["data_digest"]
     with pytest.raises(ConfigError, match="on which cgp-s3 was trained"):
-        demonstrations(run, config.load([*SETTINGS_ARGUMENTS, "data.seed=1"]))
+        demonstrations(run, model_of(config.load([*SETTINGS_ARGUMENTS, "data.seed=1"])))

@@ -11,15 +11,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from conflow.scene.constraint import RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import SIDES, DemonstrationError, check, digest, load, swap
+from conflow.scene.demonstrations import check, digest, load
+from conflow.scene.errors import DemonstrationError
+from conflow.scene.tasks.curves import SIDES
+from conflow.scene.tasks.swap import Swap, swap
+from tests.papers import keep_apart
 
 
 @pytest.mark.parametrize(("num", "seed"), [(10_000, 0), (10_000, 1), (10_000, 2), (200_000, 3)])
 def test_thirty_percent_of_the_demonstrations_collide(num: int, seed: int) -> None:
     """M is true for 30 % of the default demonstrations at the paper's threshold 0.3."""
-    rate = RobotAvoidance(PointRobots(2), 0.3).violation(swap(num, seed=seed)).double().mean()
+    rate = keep_apart(2, 0.3).violation(swap(num, seed=seed)).double().mean()
     # Four standard errors of a rate of 0.3 (1.8 points of 10,000), and 0.2 points for the amplitudes' last digit.
     assert float(rate) == pytest.approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / num) + 0.002)
 
@@ -240,8 +242,7 @@ def spoiled(value: float) -> Tensor:
         pytest.param(torch.zeros(32, 4), r"shape \(32, 4\)", id="one trajectory alone"),
         pytest.param(torch.zeros(()), r"shape \(\)", id="a number"),
         pytest.param(torch.zeros(5, 32, 2, 2), r"shape \(5, 32, 2, 2\)", id="robots in a dimension of their own"),
-        pytest.param(torch.zeros(5, 32, 5), r"shape \(5, 32, 5\)", id="odd D"),
-        pytest.param(torch.zeros(5, 32, 2), "two robots or more", id="one robot"),
+        pytest.param(torch.zeros(5, 32, 0), r"shape \(5, 32, 0\)", id="no numbers"),
         pytest.param(torch.zeros(5, 2, 4), "T >= 3", id="nothing between start and goal"),
         pytest.param(torch.zeros(0, 32, 4), "empty", id="no trajectory"),
         pytest.param(spoiled(math.nan), "2 trajectories hold NaN or infinity, the first is 2", id="NaN"),
@@ -262,3 +263,9 @@ def test_the_workspaces_border_belongs_to_it() -> None:
     check(spoiled(1.0), "these data")
     check(spoiled(-1.0), "these data")
     check(torch.zeros(1, 3, 6), "these data")
+
+
+@pytest.mark.parametrize("D", [2, 5])
+def test_a_swap_needs_two_robots_and_two_numbers_for_each(D: int) -> None:
+    with pytest.raises(DemonstrationError, match=rf"task swap: x has shape \(N, 32, {D}\), expected .* two robots or"):
+        Swap(32, D)

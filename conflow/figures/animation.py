@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, TITLES
-from conflow.training.build import judged_radius
+from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above, titled
+from conflow.training.build import joined
 from conflow.training.evaluation import Evaluation
-from conflow.training.module import SETTINGS, ConFlow
+from conflow.training.model import NONE, ConFlow
 
 TEMPLATE = Path(__file__).with_name("animation.html")
 FRAMES = 200
@@ -18,23 +18,22 @@ EACH = 2
 
 
 def animation(model: ConFlow, evaluation: Evaluation, name: str) -> str:
-    """The robots of a few trajectories under the three settings, side by side.
+    """The robots of a few trajectories under every setting, side by side.
 
     Up to two trajectories that collide without guidance and two that do not; all settings start from the same x_0.
     """
-    obstacle = model.config.sample.obstacle
-    violates = model.robots.violation(evaluation.samples["none"])
+    violates = model.trained.violation(evaluation.samples[NONE])
     chosen = [*violates.nonzero().flatten()[:EACH].tolist(), *(~violates).nonzero().flatten()[:EACH].tolist()]
     content = {
         "name": name,
-        "obstacle": [obstacle.x, obstacle.y, obstacle.radius],
+        "obstacles": model.task.obstacles(),
+        "owner": model.task.robots.owner.tolist(),
         "colours": {"robots": ROBOTS, "collision": COLLISION, "obstacle": OBSTACLE},
         "scenes": [
             {
                 "label": f"{i}: {'collides' if violates[i] else 'no collision'} without guidance",
                 "panels": [
-                    _panel(model, evaluation.samples[setting][i : i + 1], TITLES[setting], setting == "obstacle")
-                    for setting in SETTINGS
+                    _panel(model, evaluation.samples[setting][i : i + 1], setting) for setting in model.settings
                 ],
             }
             for i in chosen
@@ -53,16 +52,19 @@ def frames(x: Tensor) -> Tensor:
     return torch.cat([between, x[:, -1:]], dim=1)
 
 
-def _panel(model: ConFlow, x: Tensor, title: str, around_obstacle: bool) -> dict[str, Any]:
-    """One trajectory (1, T, D): each frame's positions, the discs' radius, and the gaps to what touches at 0."""
+def _panel(model: ConFlow, x: Tensor, setting: str) -> dict[str, Any]:
+    """One trajectory (1, T, D): each frame's positions, the bodies' radii, and the gaps to what is met at 0."""
     x = frames(x)
+    appearing = [model.judged[name] for name in model.u_c_at_inference]
+    around = any(name in model.u_c_at_inference for name in model.guided_around(setting))
+    robots = model.task.robots if around else model.trained.robots
     return {
-        "title": title,
-        "aroundObstacle": around_obstacle,
-        "radius": (model.config.constraint.radius if around_obstacle else judged_radius(model.config)) / 2,
-        "positions": _rounded(x[0].unflatten(1, (-1, 2))),
-        "robotGap": _rounded(model.robots.clearance(x)[0]),
-        "obstacleGap": _rounded(model.obstacle.clearance(x)[0]),
+        "title": titled(setting),
+        "aroundObstacle": around,
+        "radii": [round(radius, 4) for radius in robots.radii.tolist()],
+        "positions": _rounded(seen_from_above(robots, x)[0]),
+        "keptGap": _rounded(model.trained.clearance(x)[0]),
+        "obstacleGap": _rounded(joined(appearing).clearance(x)[0]) if appearing else None,
     }
 
 

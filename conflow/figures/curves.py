@@ -1,20 +1,20 @@
 """Curves over guidance weight, solver steps and flow time."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from conflow.flow.sampler import Solver
-from conflow.training.diagnostics import EVALUATIONS, Guidance, Solved, by_evaluations, collisions_by_weight
+from conflow.flow.settings import Solver
+from conflow.training.diagnostics import EVALUATIONS, GuidanceTrace, Solved, by_evaluations, collisions_by_weight
 from conflow.training.metrics import quantile_interval, wilson
-from conflow.training.module import ConFlow, Setting
+from conflow.training.model import NONE, ConFlow
 
 # Okabe and Ito's palette, in other colours than the robots.
-COLOURS: dict[Setting, str] = {"none": "#000000", "robot": "#E69F00", "obstacle": "#56B4E9"}
-STYLES: dict[Setting, str] = {"none": ":", "robot": "-", "obstacle": "--"}
-LABELS: dict[Setting, str] = {"none": "no guidance", "robot": "around robots", "obstacle": "around obstacle"}
+COLOURS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#0072B2", "#D55E00")
+STYLES = (":", "-", "--", "-.")
 SOLVERS: dict[Solver, str] = {"euler": "#0072B2", "midpoint": "#D55E00"}
 FACTORS = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
 BUDGETS = (2, 4, 8, 16, 32, 64, 128, 256)
@@ -25,22 +25,24 @@ MARK = "#666666"
 
 def guidance_weight(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Figure:
     """Collision rates against the guidance weight, up to a hundred times the config's, with Wilson's intervals."""
-    sample = model.config.sample
-    figure = Figure(figsize=(9, 3.9), layout="constrained")
-    panels: dict[Setting, tuple[float, str]] = {
-        "robot": (sample.robot_weight, "robot-collision rate"),
-        "obstacle": (sample.obstacle_weight, "object-collision rate"),
-    }
-    for axis, (setting, (configured, name)) in zip(figure.subplots(1, 2), panels.items(), strict=True):
+    sample, settings = model.config.sample, list(model.task.settings())
+    figure = Figure(figsize=(4.5 * len(settings), 3.9), layout="constrained")
+    for i, (axis, setting) in enumerate(
+        zip(figure.subplots(1, len(settings), squeeze=False)[0], settings, strict=True), 1
+    ):
+        guided = model.guided_around(setting)
+        appears = any(name in model.u_c_at_inference for name in guided)
+        configured = sample.obstacle_weight if appears else sample.robot_weight
         # A config that does not guide is shown about the weight 1.
         weights = [factor * (configured or 1.0) for factor in FACTORS]
         counts = collisions_by_weight(model, setting, x_0, weights, ends)
-        rate(axis, weights, counts, len(x_0), COLOURS[setting], name)
+        name = f"{' or '.join(guided)}-collision rate"
+        rate(axis, weights, counts, len(x_0), COLOURS[i % len(COLOURS)], name)
         axis.set_xscale("symlog", linthresh=weights[1])
         axis.set_xticks(weights, [f"{weight:g}" for weight in weights])
         axis.set_xticks([], minor=True)
         axis.set(xlim=(-weights[1] / 4, 1.4 * weights[-1]), xlabel=r"guidance weight $\lambda$", ylabel=name)
-        axis.set_title(f"guided {LABELS[setting]}\n{len(x_0)} trajectories, band: 95 % Wilson")
+        axis.set_title(f"guided around {setting}\n{len(x_0)} trajectories, band: 95 % Wilson")
         _mark(axis, configured, f"config {configured:g}")
     return figure
 
@@ -55,7 +57,9 @@ def solver_steps(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Fig
         evaluations = [one.evaluations for one in solved]
         rate(rates, evaluations, [one.collisions for one in solved], len(x_0), colour, solver)
         _median(smooth, solved, colour, solver)
-    rates.set(ylabel="robot-collision rate", title=f"no guidance, {len(x_0)} trajectories\nband: 95 % Wilson")
+    rates.set(
+        ylabel="rate of violating what training keeps", title=f"no guidance, {len(x_0)} trajectories\nband: 95 % Wilson"
+    )
     smooth.set(ylabel="smoothness (workspace units)", title="median second difference\nband: 95 % of order statistics")
     smooth.set_ylim(bottom=0)
     for axis in (rates, smooth):
@@ -86,28 +90,37 @@ def taken_back(shares: Sequence[tuple[str, Tensor]]) -> Figure:
     return figure
 
 
-def guidance(settings: Mapping[Setting, Guidance]) -> Figure:
-    """How strong guidance is along t, what it does to the barriers, and how far it moves start and goal."""
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    (ratio, drift), (robots, obstacle) = figure.subplots(2, 2)
-    for setting, found in settings.items():
-        look = {"color": COLOURS[setting], "ls": STYLES[setting], "label": LABELS[setting]}
-        if setting != "none":
+def guidance(settings: Mapping[str, GuidanceTrace]) -> Figure:
+    """How strong guidance is along t, how far it moves start and goal, and what it does to each barrier."""
+    names = list(next(iter(settings.values())).barriers)
+    rows = 1 + -(-len(names) // 2)
+    figure = Figure(figsize=(9, 3.5 * rows), layout="constrained")
+    ratio, drift, *panels = (figure.add_subplot(rows, 2, i + 1) for i in range(2 + len(names)))
+    for i, (setting, found) in enumerate(settings.items()):
+        look: dict[str, Any] = {
+            "color": COLOURS[i % len(COLOURS)],
+            "ls": STYLES[i % len(STYLES)],
+            "label": _label(setting),
+        }
+        if setting != NONE:
             ratio.plot(found.t, found.ratio, **look)
-        robots.plot(found.t, found.robot_barrier, **look)
-        obstacle.plot(found.t, found.obstacle_barrier, **look)
+        for axis, name in zip(panels, names, strict=True):
+            axis.plot(found.t, found.barriers[name], **look)
     _drift(drift, settings)
     ratio.set(title="guidance against flow", ylabel="|guidance| / $|v(x_t, t)|$")
     ratio.set_ylim(bottom=0)
-    robots.set(title="barrier of the robots", ylabel="mean $C(x_t)$ (workspace units)")
-    obstacle.set(title="barrier of the obstacle", ylabel="mean $C(x_t)$ (workspace units)")
-    for axis in (ratio, robots, obstacle):
+    for axis, name in zip(panels, names, strict=True):
+        axis.set(title=f"barrier: {name}", ylabel="mean $C(x_t)$ (workspace units)")
+        axis.axhline(0, color=MARK, lw=0.8)
+    for axis in (ratio, *panels):
         axis.set(xlabel="flow time t", xlim=(0, 1))
         axis.spines[["top", "right"]].set_visible(False)
         axis.legend(frameon=False)
-    for axis in (robots, obstacle):
-        axis.axhline(0, color=MARK, lw=0.8)
     return figure
+
+
+def _label(setting: str) -> str:
+    return "no guidance" if setting == NONE else f"around {setting}"
 
 
 def rate(axis: Axes, x: Sequence[float], counts: Sequence[int], total: int, colour: str, label: str) -> None:
@@ -128,13 +141,15 @@ def _median(axis: Axes, solved: Sequence[Solved], colour: str, label: str) -> No
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _drift(axis: Axes, settings: Mapping[Setting, Guidance]) -> None:
+def _drift(axis: Axes, settings: Mapping[str, GuidanceTrace]) -> None:
     """Bars of the drift at start and goal, a group for each setting that guides."""
-    guiding = [setting for setting in settings if setting != "none"]
+    guiding = [setting for setting in settings if setting != NONE]
     for i, setting in enumerate(guiding):
         drifts = settings[setting].start_drift, settings[setting].end_drift
-        middles = [0.4 * i - 0.2, 0.4 * i + 0.8]
-        bars = axis.bar(middles, drifts, 0.36, color=COLOURS[setting], label=LABELS[setting])
+        width = 0.8 / len(guiding)
+        middles = [place + width * (i + 0.5) - 0.4 for place in (0, 1)]
+        colour = COLOURS[(i + 1) % len(COLOURS)]
+        bars = axis.bar(middles, drifts, 0.9 * width, color=colour, label=_label(setting))
         axis.bar_label(bars, fmt="%.2g")
     axis.set_xticks([0, 1], ["start", "goal"])
     axis.set(title="drift against the unguided sample", ylabel="mean distance (workspace units)")

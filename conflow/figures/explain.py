@@ -1,8 +1,8 @@
-"""Why the corrections work or do not: closed forms beside the numbers, from our own parts and without a run."""
+"""Why the corrections work or do not, in pictures. The numbers come from `training.explanation`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from matplotlib import colormaps
@@ -13,32 +13,25 @@ from torch import Tensor
 
 from conflow.figures.curves import MARK, rate
 from conflow.figures.workspace import COLLISION, ROBOTS, save
-from conflow.flow.correction import Correction, covariant, gaussian_filter
-from conflow.flow.sampler import Field, states
+from conflow.flow.correction import Correction, covariant
 from conflow.flow.source import Source
 from conflow.results import paper
 from conflow.scene.constraint import Constraint
-from conflow.scene.trajectories import swap
 from conflow.tracking import store
-from conflow.training import config
-from conflow.training.build import build_source, fitted, random_stream, robot_avoidance
-from conflow.training.closed_form import Way, coordinates, expected, minimiser, posterior, whitened
+from conflow.training import explanation
+from conflow.training.build import build_source, fitted
+from conflow.training.closed_form import Way, coordinates, expected, minimiser
 from conflow.training.config import Config
 
 # Okabe and Ito's palette.
 FILTER, COVARIANT, PEAK, PLAIN = "#E69F00", "#0072B2", "#009E73", "#CC79A7"
 FEASIBLE, SOURCE = ROBOTS[1], "#000000"
-PAIRS = 2000
-"""Demonstrations, each with its own x_0, over which expectations in the space of trajectories are taken."""
-GAPS, PARTICLES, GAP_STEPS = 500, 1000, 100
 FEW = 0.01
 LAMBDAS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0)
 TIMES = 25
 HORIZONS = (16, 24, 32, 48, 64, 96, 128)
 LENGTH_SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)
-CLEARED = 0.9
 SHAPES = 5
-SAMPLES, SAMPLE_STEPS = 512, 100
 WEIGHTS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0)
 PAPERS, PAPER_RATE = "filter, the paper's", paper.TABLE_1["cgp"][0]
 
@@ -63,7 +56,7 @@ def draw(settings: Config, console: Console) -> None:
 
 def gap(settings: Config) -> Figure:
     """The gap between the robots when they pass, as a flow in one dimension, without and with the correction."""
-    problem, lambda_c = Gap.of(settings), settings.correction.lambda_c
+    problem, lambda_c = explanation.Gap.of(settings), settings.correction.lambda_c
     paths = {weight: problem.paths(weight) for weight in sorted({*LAMBDAS, lambda_c})}
     rates = {weight: problem.collision_rate(g[-1]) for weight, g in paths.items()}
     figure = Figure(figsize=(9.5, 7.4), layout="constrained")
@@ -84,82 +77,20 @@ def gap(settings: Config) -> Figure:
     return figure
 
 
-class Gap(NamedTuple):
-    """Flow matching of g = y1 - y2 at the middle waypoint, the signed gap with which the robots pass each other.
-
-    Attributes:
-        g_1: the demonstrations' gaps, (N,).
-        sd: standard deviation of the source's gap, which is Gaussian about 0.
-        u_c: the correction at one waypoint, without smoothing.
-        radius: the gap at which robots touch.
-    """
-
-    g_1: Tensor
-    sd: float
-    u_c: Correction
-    radius: float
-
-    @classmethod
-    def of(cls, settings: Config) -> "Gap":
-        """Some quantiles of the demonstrations' gaps, which stand for all, and the source's gap."""
-        x = demonstrations(settings)
-        middle = x.shape[1] // 2
-        g_1 = (x[:, middle, 1] - x[:, middle, 3]).quantile(_middles(GAPS))
-        # The difference of two independent robots.
-        variance = 2 * build_source(settings.source, x.shape[1]).covariance[middle, middle]
-        u_c = Correction(robot_avoidance(settings, x.shape[2]), torch.eye(1))
-        return cls(g_1, float(variance.sqrt()), u_c, settings.constraint.radius)
-
-    def field(self, weight: float) -> Field:
-        """E[x_1 - x_0 | x_t] + weight E[M | x_t] u^c(x_t) for gaps x (batch, 1, 1) and t (batch,), all alike."""
-        known = torch.stack([self.g_1, self.violates(self.g_1).float()], dim=1)
-
-        def v(x: Tensor, t: Tensor) -> Tensor:
-            g, now = x[:, :, 0], float(t[0])
-            end, M = (posterior(g / self.sd, self.g_1[:, None] / self.sd, now) @ known).split(1, dim=1)
-            # E[x_1 - x_0 | x_t] leads straight to E[x_1 | x_t].
-            return ((end - g) / (1 - now) + weight * M * self.push(g))[:, :, None]
-
-        return v
-
-    def paths(self, weight: float) -> Tensor:
-        """Where the field takes quantiles of the source, (GAP_STEPS + 1, PARTICLES)."""
-        g_0 = self.sd * torch.special.ndtri(_middles(PARTICLES))
-        return torch.stack([g[:, 0, 0] for g in states(self.field(weight), g_0[:, None, None], GAP_STEPS)])
-
-    def velocities(self, t: Tensor, g: Tensor, weight: float) -> Tensor:
-        """The field at times t (n,) and gaps g (m,), (m, n)."""
-        v = self.field(weight)
-        return torch.cat([v(g[:, None, None], one.expand(len(g)))[:, :, 0] for one in t], dim=1)
-
-    def push(self, g: Tensor) -> Tensor:
-        """What the correction adds to dg/dt at gaps g (batch, 1): both robots move."""
-        u_c = self.u_c(_beside(g[:, 0]))
-        return u_c[..., 1] - u_c[..., 3]
-
-    def violates(self, g: Tensor) -> Tensor:
-        """M of gaps g (batch,), boolean (batch,)."""
-        return self.u_c.constraint.clearance(_beside(g))[:, 0] < 0
-
-    def collision_rate(self, g: Tensor) -> float:
-        """The share of gaps g (batch,) in collision."""
-        return float(self.violates(g).float().mean())
-
-
 def support(settings: Config) -> Figure:
     """The filtered and the covariant correction of D-, along s and in the source's own standard deviations."""
-    x = demonstrations(settings)
-    constraint, source = robot_avoidance(settings, x.shape[2]), build_source(settings.source, x.shape[1])
+    x = explanation.demonstrations(settings)
+    constraint, source = explanation.label(settings), build_source(settings.source, x.shape[1])
     x = x[constraint.violation(x)].double()
     # In float64 from end to end: in the trailing modes float32's rounding would be larger than what is to be seen.
     g = constraint.gradient(x)
-    found = {"filter": _filter(settings, x.shape[1]) @ g, "covariant": covariant(source.covariance) @ g}
+    found = {"filter": explanation.filter_of(settings, x.shape[1]) @ g, "covariant": covariant(source.covariance) @ g}
     figure = Figure(figsize=(12, 4.4), layout="constrained")
     along, modes, norms = figure.subplots(1, 3)
     middling = constraint.clearance(x).amin(dim=1).median(dim=0).indices
     _along(along, {r"$\nabla C$": g[middling, :, 1]} | {name: u[middling, :, 1] for name, u in found.items()})
-    _by_mode(modes, {name: in_deviations(source, u)[..., 1].abs() for name, u in found.items()})
-    away = {name: in_deviations(source, u).square().sum(dim=(1, 2)).sqrt() for name, u in found.items()}
+    _by_mode(modes, {name: explanation.in_deviations(source, u)[..., 1].abs() for name, u in found.items()})
+    away = {name: explanation.in_deviations(source, u).square().sum(dim=(1, 2)).sqrt() for name, u in found.items()}
     _norms(norms, away)
     figure.suptitle(
         f"After one unit of t at λ = 1 the filter's bump lies {away['filter'].median():.0f} standard "
@@ -168,22 +99,17 @@ def support(settings: Config) -> Figure:
     return figure
 
 
-def in_deviations(source: Source, u: Tensor) -> Tensor:
-    """e_k^T u / sqrt(lambda_k): shifts u (batch, T, D) in the source's standard deviations by mode, (batch, m, D)."""
-    return source.modes.mT @ u / source.variance.sqrt()[:, None]
-
-
 def exact(settings: Config) -> Figure:
     """What the paper's loss asks for: collisions after the flow of its exact minimiser, and how far x_t goes astray."""
     # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
     nominal = replace(settings, data=replace(settings.data, jitter=0))
-    x_1, lambda_c = demonstrations(nominal)[:PAIRS], nominal.correction.lambda_c
-    source, constraint = build_source(nominal.source, x_1.shape[1]), robot_avoidance(nominal, x_1.shape[2])
+    x_1, lambda_c = explanation.demonstrations(nominal)[: explanation.PAIRS], nominal.correction.lambda_c
+    source, constraint = build_source(nominal.source, x_1.shape[1]), explanation.label(nominal)
     nearest = replace(nominal, constraint=replace(nominal.constraint, reduction="closest"))
-    smoothing, M = _filter(nominal, x_1.shape[1]), constraint.violation(x_1)
+    smoothing, M = explanation.filter_of(nominal, x_1.shape[1]), constraint.violation(x_1)
     corrections = {
         PAPERS: Correction(constraint, smoothing),
-        "filter, closest approach alone": Correction(robot_avoidance(nearest, x_1.shape[2]), smoothing),
+        "filter, closest approach alone": Correction(explanation.label(nearest), smoothing),
         "covariant": Correction(constraint, covariant(source.covariance)),
     }
     figure = Figure(figsize=(9.5, 4.2), layout="constrained")
@@ -191,47 +117,35 @@ def exact(settings: Config) -> Figure:
     counts: dict[tuple[str, float], int] = {}
     for (name, u_c), colour in zip(corrections.items(), (FILTER, PLAIN, COVARIANT), strict=True):
         for weight in sorted({*WEIGHTS, lambda_c}):
-            path = sampled(source, x_1, minimiser(source, x_1, M, u_c, weight))
+            path = explanation.sampled(source, x_1, minimiser(source, x_1, M, u_c, weight))
             counts[name, weight] = int(constraint.violation(path[-1]).sum())
             if weight == lambda_c:
-                t = torch.arange(len(path)) / SAMPLE_STEPS
-                astray.plot(t, torch.stack([_astray(source, x) for x in path]), color=colour, label=name)
+                t = torch.arange(len(path)) / explanation.SAMPLE_STEPS
+                astray.plot(t, torch.stack([explanation.astray(source, x) for x in path]), color=colour, label=name)
         own = {weight: count for (of, weight), count in counts.items() if of == name}
-        rate(rates, list(own), list(own.values()), SAMPLES, colour, name)
+        rate(rates, list(own), list(own.values()), explanation.SAMPLES, colour, name)
     rates.axhline(float(M.float().mean()), color=COLLISION, ls="--", lw=1, label="demonstrations")
     rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's reported rate")
     rates.set(xlabel=r"weight $\lambda_c$", ylabel="robot-collision rate")
     rates.set_ylim(top=1.6 * rates.get_ylim()[1])  # room for the legend
-    rates.set_title(f"{SAMPLES} samples of the exact flow\nband: 95 % Wilson")
+    rates.set_title(f"{explanation.SAMPLES} samples of the exact flow\nband: 95 % Wilson")
     astray.set(xlabel="flow time t", xlim=(0, 1), yscale="log", ylabel="root mean square, in standard deviations")
-    astray.set_title(rf"$x_t$ beyond the first {_kept()} modes, $\lambda_c = {lambda_c:g}$")
+    astray.set_title(rf"$x_t$ beyond the first {explanation.kept()} modes, $\lambda_c = {lambda_c:g}$")
     for axis in (rates, astray):
         _finish(axis, fontsize="small")
     figure.suptitle(
-        f"The exact minimiser of the paper's loss collides in {counts[PAPERS, lambda_c]} of {SAMPLES} samples at λ = "
-        f"{lambda_c:g}:\nit brings back what the filter pushes astray, which a network has to learn"
+        f"The exact minimiser of the paper's loss collides in {counts[PAPERS, lambda_c]} of {explanation.SAMPLES} "
+        f"samples at λ = {lambda_c:g}:\nit brings back what the filter pushes astray, which a network has to learn"
     )
     return figure
 
 
-def sampled(source: Source, x_1: Tensor, v: Field) -> list[Tensor]:
-    """The states of samples of the source, with the ends of demonstrations x_1, under a field."""
-    y = source.observe(x_1[:1]).expand(SAMPLES, -1, -1).double()
-    z = torch.randn(SAMPLES, source.modes.shape[1], y.shape[2], dtype=y.dtype, generator=random_stream("explain"))
-    return list(states(v, source.mean(y) + source.modes * source.variance.sqrt() @ z, SAMPLE_STEPS))
-
-
-def _astray(source: Source, x: Tensor) -> Tensor:
-    """The root mean square of x (batch, T, D) in the modes beyond those kept, in standard deviations."""
-    return whitened(source, x).unflatten(1, (-1, x.shape[2]))[:, _kept() :].square().mean().sqrt()
-
-
 def eigenvalues(settings: Config) -> Figure:
     """How wide the source is in each of its modes, how wide the demonstrations are there, and the modes along s."""
-    x = demonstrations(settings)
-    x = x[~robot_avoidance(settings, x.shape[2]).violation(x)].double()
+    x = explanation.demonstrations(settings)
+    x = x[~explanation.label(settings).violation(x)].double()
     likely = fitted(replace(settings, source=replace(settings.source, fit=True)), x)
-    kept = _kept()
+    kept = explanation.kept()
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     widths, shapes = figure.subplots(1, 2)
     lengths, left_out = [], []
@@ -259,12 +173,16 @@ def predicted_end(settings: Config) -> Figure:
     """Who is in collision on the way, at x_t and at the end E[x_1 | x_t] that is expected from there."""
     # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
     # Modes beyond those kept are as wide as their white part, and would tell x_1 long before the others do.
-    nominal = replace(settings, data=replace(settings.data, jitter=0), source=replace(settings.source, modes=_kept()))
-    x = demonstrations(nominal)
-    constraint, source = robot_avoidance(nominal, x.shape[2]), build_source(nominal.source, x.shape[1])
+    nominal = replace(
+        settings, data=replace(settings.data, jitter=0), source=replace(settings.source, modes=explanation.kept())
+    )
+    x = explanation.demonstrations(nominal)
+    constraint, source = explanation.label(nominal), build_source(nominal.source, x.shape[1])
     violates = constraint.violation(x)
     t = torch.arange(TIMES) / TIMES
-    feasible, every = ([expected(source, x_1[:PAIRS], now) for now in t.tolist()] for x_1 in (x[~violates], x))
+    feasible, every = (
+        [expected(source, x_1[: explanation.PAIRS], now) for now in t.tolist()] for x_1 in (x[~violates], x)
+    )
     figure = Figure(figsize=(12, 4.6), layout="constrained")
     shares, pushes, told = figure.subplots(1, 3)
     at, end = (
@@ -275,8 +193,8 @@ def predicted_end(settings: Config) -> Figure:
     shares.plot(t, end, color=COVARIANT, label=r"at the predicted end $E[x_1 | x_t]$")
     shares.set(ylabel="share in collision", title="pairs with a feasible $x_1$, $D^+$", ylim=(0, 1.02))
     u_c = Correction(constraint, covariant(source.covariance))
-    _pushes(pushes, t, feasible, x[~violates][:PAIRS], u_c)
-    _told(told, t, every, violates[:PAIRS], constraint)
+    _pushes(pushes, t, feasible, x[~violates][: explanation.PAIRS], u_c)
+    _told(told, t, every, violates[: explanation.PAIRS], constraint)
     for axis in (shares, pushes, told):
         axis.set(xlabel="flow time t", xlim=(0, 1))
         _finish(axis, fontsize="small")
@@ -293,94 +211,40 @@ def lambda_scale(settings: Config) -> Figure:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     ell = settings.source.length_scale
-    by_horizon = [clearing_times(settings, T, ell) for T in HORIZONS]
-    by_length = [clearing_times(settings, settings.data.horizon, length) for length in LENGTH_SCALES]
+    by_horizon = [explanation.clearing_times(settings, T, ell) for T in HORIZONS]
+    by_length = [explanation.clearing_times(settings, settings.data.horizon, length) for length in LENGTH_SCALES]
     spans = {name: _span([times[name] for times in (*by_horizon, *by_length)]) for name in LOOKS}
     for axis, at, times in zip(axes, (HORIZONS, LENGTH_SCALES), (by_horizon, by_length), strict=True):
         _clearing(axis, at, times, spans)
     axes[0].set(xlabel="waypoints T", title=rf"length scale $\ell = {ell:g}$")
-    axes[0].set_ylabel(rf"$\lambda t$ to clear {CLEARED:.0%} of $D^-$ (workspace units)")
+    axes[0].set_ylabel(rf"$\lambda t$ to clear {explanation.CLEARED:.0%} of $D^-$ (workspace units)")
     axes[1].set(xlabel=r"length scale $\ell$ (of s)", title=f"T = {settings.data.horizon} waypoints")
     _finish(axes[0], fontsize="small", title="largest / smallest of both panels", alignment="left")
     figure.suptitle(
-        f"λ means the same within a factor of {spans[ROW_SUM]:.1f} with Σ scaled by its row sums, "
-        f"of {spans[PEAKED]:.1f} by its largest entry, of {spans[SIGMA]:.0f} as it is"
+        f"λ means the same within a factor of {spans[explanation.ROW_SUM]:.1f} with Σ scaled by its row sums, "
+        f"of {spans[explanation.PEAKED]:.1f} by its largest entry, of {spans[explanation.SIGMA]:.0f} as it is"
     )
     return figure
 
 
-ROW_SUM, PEAKED, SIGMA = r"$\Sigma$ / largest row sum (ours)", r"$\Sigma$ / largest entry", r"$\Sigma$"
-FILTERED = "Gaussian filter"
 LOOKS: dict[str, dict[str, Any]] = {
-    ROW_SUM: {"color": COVARIANT, "ls": "-", "marker": "o"},
-    PEAKED: {"color": PEAK, "ls": "--", "marker": "s"},
-    SIGMA: {"color": PLAIN, "ls": "-.", "marker": "^"},
-    FILTERED: {"color": FILTER, "ls": ":", "marker": "D"},
+    explanation.ROW_SUM: {"color": COVARIANT, "ls": "-", "marker": "o"},
+    explanation.PEAKED: {"color": PEAK, "ls": "--", "marker": "s"},
+    explanation.SIGMA: {"color": PLAIN, "ls": "-.", "marker": "^"},
+    explanation.FILTERED: {"color": FILTER, "ls": ":", "marker": "D"},
 }
 
 
-def clearing_times(settings: Config, T: int, length_scale: float) -> dict[str, float]:
-    """lambda t until x' = lambda S grad C(x) has taken most of D- out of collision, for the four matrices S of LOOKS.
-
-    By definition the time of a S is that of S divided by a, so that Sigma is followed once.
-    """
-    chosen = replace(settings, data=replace(settings.data, horizon=T, num=PAIRS // 2))
-    x = demonstrations(chosen)
-    constraint = robot_avoidance(chosen, x.shape[2])
-    x = x[constraint.violation(x)]
-    Sigma = build_source(replace(settings.source, length_scale=length_scale), T).covariance
-    row_sum = clearing_time(Correction(constraint, covariant(Sigma)), x)
-    sigma = row_sum / float(Sigma.abs().sum(dim=1).max())
-    smoothed = clearing_time(Correction(constraint, _filter(settings, T)), x)
-    return {ROW_SUM: row_sum, PEAKED: sigma * float(Sigma.max()), SIGMA: sigma, FILTERED: smoothed}
-
-
-def clearing_time(u_c: Correction, x: Tensor, h: float = 0.01) -> float:
-    """The time in which x' = u^c(x) takes CLEARED of the colliding x (batch, T, D) out of collision, to h."""
-    steps = 0
-    while (u_c.constraint.clearance(x).amin(dim=1) < 0).float().mean() > 1 - CLEARED:
-        x, steps = x + h * u_c(x), steps + 1
-    return steps * h
-
-
-def demonstrations(settings: Config) -> Tensor:
-    """The swaps that the settings describe, D+ and D-, (N, T, D)."""
-    data = settings.data
-    return swap(data.num, data.horizon, data.amplitudes, data.jitter, data.seed)
-
-
-def _beside(g: Tensor) -> Tensor:
-    """Two robots at one waypoint with y1 - y2 = g (batch,), as trajectories (batch, 1, 4)."""
-    zero = torch.zeros_like(g)
-    return torch.stack([zero, g / 2, zero, -g / 2], dim=1)[:, None]
-
-
-def _middles(count: int) -> Tensor:
-    """The middles of `count` equal parts of [0, 1]: levels of quantiles that stand for a law without chance."""
-    return (torch.arange(count) + 0.5) / count
-
-
-def _filter(settings: Config, T: int) -> Tensor:
-    return gaussian_filter(T, settings.correction.sigma, settings.correction.width)
-
-
-def _kept() -> int:
-    """The leading modes that the spectral network works in."""
-    modes = config.load(["ablation=spectral"]).source.modes
-    assert modes is not None
-    return modes
-
-
-def _fields(axes: Sequence[Axes], problem: Gap, paths: Mapping[float, Tensor]) -> None:
+def _fields(axes: Sequence[Axes], problem: explanation.Gap, paths: Mapping[float, Tensor]) -> None:
     """The field over t and g in colour, a panel for each weight, with some paths through it."""
-    t, g = torch.linspace(0, 1, GAP_STEPS + 1), torch.linspace(-2, 2, 201)
+    t, g = torch.linspace(0, 1, explanation.GAP_STEPS + 1), torch.linspace(-2, 2, 201)
     v = {weight: problem.velocities(t[:-1], g, weight) for weight in paths}
     # Outside the demonstrations the field grows like 1 / (1 - t) and would leave no colour for the rest.
     limit = max(float(one[g.abs() < 1].abs().max()) for one in v.values())
     for axis, (weight, path) in zip(axes, paths.items(), strict=True):
         grid = t[:-1].numpy(), g.numpy(), v[weight].numpy()
         image = axis.pcolormesh(*grid, cmap="PuOr", vmin=-limit, vmax=limit, shading="nearest")
-        axis.plot(t, path[:, PARTICLES // 80 :: PARTICLES // 40], color="black", lw=0.6)
+        axis.plot(t, path[:, explanation.PARTICLES // 80 :: explanation.PARTICLES // 40], color="black", lw=0.6)
         for side in (-problem.radius, problem.radius):
             axis.axhline(side, color=COLLISION, ls="--", lw=1.2)
         axis.set(xlabel="flow time t", ylabel="signed gap g (workspace units)", xlim=(0, 1), ylim=(-2, 2))
@@ -388,7 +252,7 @@ def _fields(axes: Sequence[Axes], problem: Gap, paths: Mapping[float, Tensor]) -
     axes[0].figure.colorbar(image, ax=axes, label="dg/dt (workspace units per t)", extend="both")
 
 
-def _densities(axis: Axes, problem: Gap, ends: Mapping[float, Tensor]) -> None:
+def _densities(axis: Axes, problem: explanation.Gap, ends: Mapping[float, Tensor]) -> None:
     """The gaps of demonstrations and of where the flow ends, and the density of the source."""
     bins = torch.linspace(-2, 2, 81).tolist()
     share = torch.full_like(problem.g_1, 1 / (len(problem.g_1) * (bins[1] - bins[0])))
@@ -439,7 +303,7 @@ def _norms(axis: Axes, values: Mapping[str, Tensor]) -> None:
 
 
 def _widths(axis: Axes, epsilon: float, kept: int) -> None:
-    """Label the widths by mode, with the kernel's white part and the modes that are kept."""
+    """Label the widths by mode, with the kernel's white part and the modes that are explanation.kept."""
     floor = epsilon**0.5
     axis.axhline(floor, color=MARK, lw=0.8)
     axis.annotate(r"$\sqrt{\epsilon}$: the kernel's white part", (kept + 2, floor), (0, 4), "data", "offset points")

@@ -15,13 +15,15 @@ from conflow.figures.animation import animation
 from conflow.figures.front import front
 from conflow.results import comparison
 from conflow.results.records import Record
+from conflow.scene.task import Task
 from conflow.tracking import store
 from conflow.training import diagnostics
 from conflow.training.build import random_stream
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.evaluation import Evaluation, cycle
-from conflow.training.module import SETTINGS, ConFlow, start_and_goal
-from conflow.training.reload import MODEL_FILE, demonstrations, load_model
+from conflow.training.model import NONE, ConFlow, start_and_goal
+from conflow.training.model_file import MODEL_FILE, load_model
+from conflow.training.reload import demonstrations
 
 NUM = 512
 TIMES = (0.3, 0.6, 0.9)
@@ -32,7 +34,7 @@ LONGEST = 200
 """Characters of a folder's name; systems allow 255 bytes."""
 
 
-def draw(wanted: Sequence[str], split: SplitName, console: Console) -> None:
+def draw(wanted: Sequence[str], split: SplitName, console: Console, task: Task | None = None) -> None:
     """Draw the pictures of each run, for starts and goals of a split; of several runs also a comparison of them.
 
     Those of the test split are in a folder `test` of their own, so that neither takes the place of the other.
@@ -41,7 +43,7 @@ def draw(wanted: Sequence[str], split: SplitName, console: Console) -> None:
         ConfigError: there is no such run.
     """
     runs = [store.find_run(name) for name in wanted]
-    made = [(f"{_title(run)}, {SPLITS[split]} split", *_draw_run(run, split, console)) for run in runs]
+    made = [(f"{_title(run)}, {SPLITS[split]} split", *_draw_run(run, split, console, task)) for run in runs]
     if len(made) > 1:
         console.print("all runs: methods.png, taken_back.png", highlight=False)
         methods = workspace.methods([(title, model, evaluation) for title, model, evaluation, _ in made])
@@ -75,7 +77,7 @@ def _title(run: Run) -> str:
 
 def _collisions(title: str, model: ConFlow, evaluation: Evaluation) -> str:
     """The title, and how many of the trajectories without guidance collide."""
-    collide = model.robots.violation(evaluation.samples["none"])
+    collide = model.trained.violation(evaluation.samples[NONE])
     return f"{title}: {int(collide.sum())} of {len(collide)} collide"
 
 
@@ -87,10 +89,10 @@ def _subfolder(split: SplitName) -> str:
     return "" if split == "val" else split
 
 
-def _draw_run(run: Run, split: SplitName, console: Console) -> tuple[ConFlow, Evaluation, Tensor]:
+def _draw_run(run: Run, split: SplitName, console: Console, task: Task | None) -> tuple[ConFlow, Evaluation, Tensor]:
     """Write and log a run's pictures; its model, the samples that they show, and `taken_back` at t = 0.6."""
-    model = load_model(store.artifact(run, MODEL_FILE))
-    data = demonstrations(run, model.config)
+    model = load_model(store.artifact(run, MODEL_FILE), task=task)
+    data = demonstrations(run, model)
     x_1 = cycle(data.held_out[split].x, NUM)
     name = str(run.info.run_name)
     # A name given in MLflow's pages may hold anything, also a way out of the folder.
@@ -104,9 +106,9 @@ def _draw_run(run: Run, split: SplitName, console: Console) -> tuple[ConFlow, Ev
         "sources": lambda: workspace.sources(model, evaluation),
         "page": lambda: workspace.page(model, data, evaluation, split),
         "flow": lambda: workspace.flow(model, x_0, ends),
-        "distances": lambda: workspace.distances(model, evaluation),
+        "clearances": lambda: workspace.clearances(model, evaluation),
         "taken_back": lambda: curves.taken_back([(f"t = {t}", share) for t, share in shares.items()]),
-        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in SETTINGS}),
+        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in model.settings}),
         "solver_steps": lambda: curves.solver_steps(model, x_0, ends),
         "guidance_weight": lambda: curves.guidance_weight(model, x_0, ends),
     }
@@ -126,7 +128,7 @@ def _draw_run(run: Run, split: SplitName, console: Console) -> tuple[ConFlow, Ev
 def sample(model: ConFlow, x_1: Tensor) -> Evaluation:
     """Trajectories under every setting from the same x_0, with the starts and goals of x_1 (batch, T, D)."""
     x_0 = model.source.sample(model.source.observe(x_1), random_stream("figures", model.config.seed))
-    return Evaluation(x_0, {setting: model.flow(x_0, setting, start_and_goal(x_1)) for setting in SETTINGS})
+    return Evaluation(x_0, {setting: model.flow(x_0, setting, start_and_goal(x_1)) for setting in model.settings})
 
 
 def _log(run: Run, files: Sequence[Path], split: SplitName) -> None:

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from conflow.flow.sampler import states
 from conflow.scene.constraint import Constraint
-from conflow.training.build import judged_radius, robot_avoidance
+from conflow.scene.robots import Robots
+from conflow.training.build import joined, labels
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import Evaluation
-from conflow.training.module import SETTINGS, ConFlow
+from conflow.training.model import NONE, ConFlow
 
 # Okabe and Ito's palette.
 ROBOTS = ("#0072B2", "#009E73", "#CC79A7", "#56B4E9")
@@ -27,19 +28,23 @@ OF_TRAINING = ("page", "demonstrations", "sources")
 """The pictures that training draws and logs."""
 SHOWN = 60
 DPI = 110
-TITLES = {"none": "generated, no guidance", "robot": "guided around robots", "obstacle": "guided around obstacle"}
 TIMES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+def titled(setting: str) -> str:
+    """What a panel of a setting is called."""
+    return "generated, no guidance" if setting == NONE else f"guided around {setting}"
 
 
 def demonstrations(data: DemonstrationData) -> Figure:
     """The paper's first figure: demonstrations without and with a collision."""
     figure, axes = _workspaces(1, 2)
-    robots = robot_avoidance(data.config, data.D)
+    kept = labels(data.config, data.task)
     for axis, violates, name in zip(axes, (False, True), ("feasible, $D^+$", "in collision, $D^-$"), strict=True):
         chosen = data.violates == violates
-        _trajectories(axis, data.x[chosen], data.violates[chosen], robots)
+        _trajectories(axis, data.x[chosen], data.violates[chosen], kept)
         axis.set_title(f"{name}: {int(chosen.sum())} of {len(data.x)}")
-    _legend(figure, data.D // 2)
+    _legend(figure, data.task.robots)
     return figure
 
 
@@ -48,35 +53,36 @@ def sources(model: ConFlow, evaluation: Evaluation) -> Figure:
     figure, axes = _workspaces(1, 2)
     panels = {"source, $x_0$": evaluation.source_samples, "generated, $x_1$": evaluation.samples["none"]}
     for axis, (name, x) in zip(axes, panels.items(), strict=True):
-        _judged(axis, x, model.robots, name)
+        _judged(axis, x, model.trained, name)
     _zoom_out(axes[:1], evaluation.source_samples)
-    _legend(figure, model.D // 2)
+    _legend(figure, model.task.robots)
     return figure
 
 
 def page(model: ConFlow, data: DemonstrationData, evaluation: Evaluation, split: SplitName) -> Figure:
     """A run at a glance: demonstrations of a split, what it starts from, and what it makes under the three settings."""
-    config = model.config
-    figure, axes = _workspaces(2, 3)
-    _judged(axes[0], data.held_out[split].x, model.robots, f"{SPLITS[split]} demonstrations")
-    _judged(axes[1], evaluation.source_samples, model.robots, f"source: {config.source.kind}")
+    config, after = model.config, 2 + len(model.settings)
+    figure, axes = _workspaces(-(-(after + 1) // 3), 3, after + 1)
+    _judged(axes[0], data.held_out[split].x, model.trained, f"{SPLITS[split]} demonstrations")
+    _judged(axes[1], evaluation.source_samples, model.trained, f"source: {config.source.kind}")
     _zoom_out(axes[1:2], evaluation.source_samples)
-    _settings(axes[2:5], model, evaluation)
-    _distances(axes[5], evaluation.samples["none"], model)
-    axes[5].set_title("distance of the robots\nno guidance")
-    _legend(figure, model.D // 2)
-    figure.suptitle(f"{config.ablation}, seed {config.seed}, preset {config.preset}, {SPLITS[split]} split")
+    _settings(axes[2:after], model, evaluation)
+    _clearances(axes[after], evaluation.samples[NONE], model)
+    axes[after].set_title("smallest clearance\nno guidance")
+    _legend(figure, model.task.robots)
+    figure.suptitle(f"{config.name}, preset {config.preset}, {SPLITS[split]} split")
     return figure
 
 
 def methods(runs: Sequence[tuple[str, ConFlow, Evaluation]]) -> Figure:
-    """Several runs, a row for each, under the three settings."""
-    figure, axes = _workspaces(len(runs), len(SETTINGS))
+    """Several runs, a row for each, under every setting."""
+    columns = max(len(model.settings) for _, model, _ in runs)
+    figure, axes = _workspaces(len(runs), columns)
     for i, (name, model, evaluation) in enumerate(runs):
-        row = axes[len(SETTINGS) * i :]
-        _settings(row[: len(SETTINGS)], model, evaluation)
+        row = axes[columns * i :]
+        _settings(row[: len(model.settings)], model, evaluation)
         row[0].set_ylabel(f"{name}\n\n{row[0].get_ylabel()}")
-    _legend(figure, max(model.D // 2 for _, model, _ in runs))
+    _legend(figure, max((model.task.robots for _, model, _ in runs), key=lambda robots: robots.count))
     return figure
 
 
@@ -87,19 +93,20 @@ def flow(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Figure:
     shown = [round(t * steps) for t in TIMES]
     x = {k: x for k, x in enumerate(states(model.field("none", ends), x_0, steps, solver)) if k in shown}
     for axis, k in zip(axes, shown, strict=True):
-        _judged(axis, x[k], model.robots, f"$t = {k / steps:.2g}$")
+        _judged(axis, x[k], model.trained, f"$t = {k / steps:.2g}$")
     _zoom_out(axes, x_0)
-    _legend(figure, model.D // 2)
+    _legend(figure, model.task.robots)
     return figure
 
 
-def distances(model: ConFlow, evaluation: Evaluation) -> Figure:
-    """The distance of the nearest robots along s under the three settings, with the distance at which they touch."""
-    figure = Figure(figsize=(10.8, 3.9), layout="constrained")
-    for axis, setting in zip(figure.subplots(1, len(SETTINGS), sharey=True), SETTINGS, strict=True):
+def clearances(model: ConFlow, evaluation: Evaluation) -> Figure:
+    """The smallest clearance of what training keeps, along s under every setting; below 0 it is violated."""
+    settings = model.settings
+    figure = Figure(figsize=(3.6 * len(settings), 3.9), layout="constrained")
+    for axis, setting in zip(figure.subplots(1, len(settings), sharey=True), settings, strict=True):
         x = evaluation.samples[setting]
-        _distances(axis, x, model)
-        axis.set_title(f"{TITLES[setting]}\n{_share(model.robots.violation(x))} collide")
+        _clearances(axis, x, model)
+        axis.set_title(f"{titled(setting)}\n{_share(model.trained.violation(x))} collide")
         axis.label_outer()
     handles = [
         Line2D([], [], color="#666666", label="without collision"),
@@ -128,12 +135,14 @@ def save(figures: Mapping[str, Figure], folder: Path) -> None:
         figure.savefig(folder / f"{name}.png", dpi=DPI)
 
 
-def _workspaces(rows: int, columns: int) -> tuple[Figure, list[Axes]]:
+def _workspaces(rows: int, columns: int, count: int | None = None) -> tuple[Figure, list[Axes]]:
+    """So many panels, all of the grid by default."""
     figure = Figure(figsize=(3.6 * columns, 3.9 * rows + 0.5), layout="constrained")
-    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(rows * columns)]
+    count = count or rows * columns
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
     for i, axis in enumerate(axes):
         axis.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
-        axis.set_xlabel("x (workspace units)" if i >= (rows - 1) * columns else "")
+        axis.set_xlabel("x (workspace units)" if i >= count - columns else "")
         axis.set_ylabel("y (workspace units)" if i % columns == 0 else "")
         axis.spines[["top", "right"]].set_visible(False)
     return figure, axes
@@ -148,15 +157,18 @@ def _zoom_out(axes: Sequence[Axes], x: Tensor) -> None:
 
 
 def _settings(axes: Sequence[Axes], model: ConFlow, evaluation: Evaluation) -> None:
-    """Each setting's trajectories, judged by what the setting avoids."""
-    for axis, setting in zip(axes, SETTINGS, strict=True):
-        if setting != "obstacle":
-            _judged(axis, evaluation.samples[setting], model.robots, TITLES[setting])
+    """Each setting's trajectories, judged by what the setting guides around."""
+    for axis, setting in zip(axes, model.settings, strict=True):
+        appears = [name for name in model.guided_around(setting) if name in model.u_c_at_inference]
+        if not appears:
+            _judged(axis, evaluation.samples[setting], model.trained, titled(setting))
             continue
-        _judged(axis, evaluation.samples[setting], model.obstacle, TITLES[setting], "hit it")
-        _obstacle(axis, model)
-        unguided = _share(model.obstacle.violation(evaluation.samples["none"]))
-        axis.set_xlabel(f"hits unguided: {unguided}\n{axis.get_xlabel()}".strip())
+        met = joined([model.judged[name] for name in appears])
+        _judged(axis, evaluation.samples[setting], met, titled(setting), "hit it")
+        _obstacles(axis, model)
+        axis.set_xlabel(
+            f"hits unguided: {_share(met.violation(evaluation.samples[NONE]))}\n{axis.get_xlabel()}".strip()
+        )
 
 
 def _judged(axis: Axes, x: Tensor, constraint: Constraint, name: str, verb: str = "collide") -> None:
@@ -172,51 +184,53 @@ def _share(violates: Tensor) -> str:
 
 def _trajectories(axis: Axes, x: Tensor, violates: Tensor, constraint: Constraint) -> None:
     """The first trajectories, each robot's in its colour; those in violation on top, marked at the closest approach."""
-    x, violates = x[:SHOWN], violates[:SHOWN]
-    paths = x.unflatten(2, (-1, 2))
-    for robot in range(paths.shape[2]):
+    x, violates, robots = x[:SHOWN], violates[:SHOWN], constraint.robots
+    paths = seen_from_above(robots, x)
+    for body, robot in enumerate(robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]
-        axis.add_collection(LineCollection(list(paths[~violates, :, robot].numpy()), colors=colour, alpha=0.4, lw=0.9))
-        axis.add_collection(
-            LineCollection(list(paths[violates, :, robot].numpy()), colors=COLLISION, alpha=0.9, lw=0.9)
-        )
-        starts = paths[:, 0, robot]
+        axis.add_collection(LineCollection(list(paths[~violates, :, body].numpy()), colors=colour, alpha=0.4, lw=0.9))
+        axis.add_collection(LineCollection(list(paths[violates, :, body].numpy()), colors=COLLISION, alpha=0.9, lw=0.9))
+        starts = paths[:, 0, body]
         axis.scatter(starts[:, 0], starts[:, 1], s=6, color=colour, zorder=3)
     contacts = _contacts(x, constraint)[violates]
     axis.scatter(contacts[:, 0], contacts[:, 1], marker="x", s=22, color="black", linewidth=0.9, zorder=4)
 
 
+def seen_from_above(robots: Robots, x: Tensor) -> Tensor:
+    """The bodies' paths in the plane, (batch, T, bodies, 2); of those in space x and y."""
+    return robots.points(x)[..., :2]
+
+
 def _contacts(x: Tensor, constraint: Constraint) -> Tensor:
-    """Where trajectories (batch, T, D) are closest to a collision, (batch, 2): amid the robots that C pushes there."""
-    closest = torch.arange(len(x)), constraint.clearance(x).argmin(dim=1)
-    pushed = constraint.gradient(x).unflatten(2, (-1, 2))[closest].norm(dim=2, keepdim=True) > 0
-    return (x.unflatten(2, (-1, 2))[closest] * pushed).sum(dim=1) / pushed.sum(dim=1)
+    """Where trajectories (batch, T, D) are closest to a violation, (batch, 2): amid the bodies that C pushes there."""
+    robots, closest = constraint.robots, (torch.arange(len(x)), constraint.clearance(x).argmin(dim=1))
+    pushed = robots.moved(constraint.gradient(x))[closest][..., None]
+    return (seen_from_above(robots, x)[closest] * pushed).sum(dim=1) / pushed.sum(dim=1)
 
 
-def _distances(axis: Axes, x: Tensor, model: ConFlow) -> None:
-    x, radius = x[:SHOWN], judged_radius(model.config)
-    distance, violates = model.robots.clearance(x) + radius, model.robots.violation(x)
+def _clearances(axis: Axes, x: Tensor, model: ConFlow) -> None:
+    x = x[:SHOWN]
+    c, violates = model.trained.clearance(x), model.trained.violation(x)
     s = torch.linspace(0, 1, x.shape[1])
     for shown, colour in ((~violates, "#666666"), (violates, COLLISION)):
-        axis.plot(s, distance[shown].T, color=colour, alpha=0.5, lw=0.9)
-    axis.axhline(radius, color="black", ls="--", lw=1)
-    axis.annotate(f"touching at {radius:g}", (0.02, radius), textcoords="offset points", xytext=(0, 3))
-    axis.set(xlim=(0, 1), ylim=(0, 2.1), aspect="auto")
-    axis.set(xlabel="s (trajectory time)", ylabel="distance (workspace units)")
+        axis.plot(s, c[shown].T, color=colour, alpha=0.5, lw=0.9)
+    axis.axhline(0, color="black", ls="--", lw=1)
+    axis.set(xlim=(0, 1), ylim=(None, None), aspect="auto")
+    axis.set(xlabel="s (trajectory time)", ylabel="clearance")
     axis.set_box_aspect(1)
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _obstacle(axis: Axes, model: ConFlow) -> None:
-    """The obstacle, and around it the circle that the robots' centres must not enter."""
-    obstacle = model.config.sample.obstacle
-    touching = obstacle.radius + model.config.constraint.radius / 2
-    axis.add_patch(Circle((obstacle.x, obstacle.y), obstacle.radius, color=OBSTACLE, zorder=2.5))
-    axis.add_patch(Circle((obstacle.x, obstacle.y), touching, fill=False, ls="--", color="black", lw=1, zorder=3))
+def _obstacles(axis: Axes, model: ConFlow) -> None:
+    """The obstacles, and around each the circle that the largest body's centre must not enter."""
+    reach = float(model.task.robots.radii.max())
+    for x, y, radius in model.task.obstacles():
+        axis.add_patch(Circle((x, y), radius, color=OBSTACLE, zorder=2.5))
+        axis.add_patch(Circle((x, y), radius + reach, fill=False, ls="--", color="black", lw=1, zorder=3))
 
 
-def _legend(figure: Figure, robots: int) -> None:
-    handles = [Line2D([], [], color=ROBOTS[i % len(ROBOTS)], label=f"robot {i + 1}") for i in range(robots)]
+def _legend(figure: Figure, robots: Robots) -> None:
+    handles = [Line2D([], [], color=ROBOTS[i % len(ROBOTS)], label=f"robot {i + 1}") for i in range(robots.count)]
     handles.append(
         Line2D(
             [],

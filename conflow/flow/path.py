@@ -11,6 +11,9 @@ def interpolate(x_0: Tensor, x_1: Tensor, t: Tensor) -> Tensor:
 
     `lerp` rather than the formula: x_0 and x_1 are met to the last bit at t = 0 and 1, and a waypoint at which
     both agree stays where it is for every t.
+
+    >>> interpolate(torch.zeros(2, 1, 1), torch.ones(2, 1, 1), torch.tensor([0.25, 1.0])).flatten()
+    tensor([0.2500, 1.0000])
     """
     return torch.lerp(x_0, x_1, t[:, None, None])
 
@@ -24,6 +27,10 @@ def end(x_t: Tensor, u_t: Tensor, t: Tensor) -> Tensor:
     """x_t + (1 - t) u_t: where the straight path through x_t with velocity u_t (batch, T, D) ends at t = 1.
 
     With the marginal velocity E[x_1 - x_0 | x_t] it is E[x_1 | x_t], the demonstration expected from x_t on.
+
+    >>> x_0, x_1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.25])
+    >>> end(interpolate(x_0, x_1, t), velocity(x_0, x_1), t).item()
+    1.0
     """
     return x_t + (1 - t[:, None, None]) * u_t
 

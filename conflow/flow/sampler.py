@@ -2,12 +2,12 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from conflow.flow.path import end
+from conflow.flow.settings import Guidance, Solver
 
 Field = Callable[[Tensor, Tensor], Tensor]
 """A velocity field: x (batch, T, D) and t (batch,) to dx/dt (batch, T, D)."""
@@ -15,13 +15,8 @@ Field = Callable[[Tensor, Tensor], Tensor]
 PIECE = 2048
 """Trajectories that a network sees at a time, the same on every machine: a matrix product's bits vary with its size."""
 
-Solver = Literal["euler", "midpoint", "rk4"]
-
-
 Push = Callable[[Tensor], Tensor]
 """lambda u^c: where a trajectory x (batch, T, D) should move, with its weight; of several constraints the sum."""
-
-Guidance = Literal["point", "end", "descent"]
 
 
 def guided(v: Field, push: Push) -> Field:
@@ -112,7 +107,12 @@ def states(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler") ->
 
 
 def integrate(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler") -> Tensor:
-    """x_1: where the ODE that starts at x_0 (batch, T, D) arrives at t = 1."""
+    """x_1: where the ODE that starts at x_0 (batch, T, D) arrives at t = 1.
+
+    >>> v = lambda x, t: x  # dx/dt = x ends at e = 2.71828...
+    >>> [round(integrate(v, torch.ones(1, 1, 1), 10, solver).item(), 3) for solver in ("euler", "midpoint", "rk4")]
+    [2.594, 2.714, 2.718]
+    """
     return deque(states(v, x_0, steps, solver), maxlen=1).pop()
 
 

@@ -4,34 +4,35 @@ import contextlib
 import math
 import os
 import queue
-import re
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from rich.console import Console
 
-from conflow.scene.trajectories import DemonstrationError
+from conflow.scene.errors import DemonstrationError
 from conflow.tracking import code, resume, signals, store
-from conflow.training import config
+from conflow.training import config, progress
 from conflow.training.config import Config
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.progress import ProgressDisplay
 
-STEPS = re.compile(r"^(training|sampling test|sampling validation) (\d+)/(\d+)")
 STAGES = {"training": (0.0, 0.9), "sampling test": (0.9, 0.05), "sampling validation": (0.95, 0.05)}
 """What comes before each stage of a cell, and what it adds, as shares of the whole."""
 
 
 @dataclass
-class Cell:
+class Job:
     """One experiment of the grid: the arguments that ask for it, how far it is, and whether it failed to end well.
 
     Attributes:
         again: why it is trained although it was before.
+        progress: the file in which its process says how far it is.
     """
 
     arguments: list[str]
@@ -41,10 +42,11 @@ class Cell:
     again: str = ""
     failed: bool = True
     output: list[str] = field(default_factory=list)
+    progress: Path | None = None
 
     @property
     def name(self) -> str:
-        return f"{self.config.ablation}-s{self.config.seed}"
+        return self.config.name
 
 
 def run(
@@ -73,7 +75,7 @@ def run(
         ConfigError: any of the cells cannot be asked for; then none is started.
     """
     cells = [
-        Cell(chosen, config.load(chosen))
+        Job(chosen, config.load(chosen))
         for seed in seeds
         for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
     ]
@@ -94,7 +96,7 @@ def run(
     return sum(cell.failed for cell in todo)
 
 
-def _finished(cell: Cell, any_code: bool) -> bool:
+def _finished(cell: Job, any_code: bool) -> bool:
     """Whether a cell is; if it was interrupted, it is told to go on from there, and if by other code, why it is not."""
     try:
         digest = DemonstrationData(cell.config).digest
@@ -112,19 +114,23 @@ def _finished(cell: Cell, any_code: bool) -> bool:
     return False
 
 
-def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
-    waiting: queue.SimpleQueue[Cell] = queue.SimpleQueue()
+def _train_all(cells: Sequence[Job], jobs: int, console: Console) -> None:
+    waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
     for cell in cells:
         waiting.put(cell)
     processes: set[subprocess.Popen[str]] = set()
     threads = [threading.Thread(target=_work, args=(waiting, processes, jobs), daemon=True) for _ in range(jobs)]
-    with ProgressDisplay(console) as display:
+    with ProgressDisplay(console) as display, tempfile.TemporaryDirectory() as folder:
+        for i, cell in enumerate(cells):
+            cell.progress = Path(folder, str(i))
         task = display.add("cells", len(cells))
         for thread in threads:
             thread.start()
         try:
             while any(thread.is_alive() for thread in threads):
                 time.sleep(0.5)
+                for cell in cells:
+                    _look(cell)
                 busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
                 display.update(task, math.floor(10 * sum(cell.share for cell in cells)) / 10, busy)
         except BaseException:
@@ -134,7 +140,7 @@ def _train_all(cells: Sequence[Cell], jobs: int, console: Console) -> None:
 
 
 def _stop(
-    waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], threads: Sequence[threading.Thread]
+    waiting: "queue.SimpleQueue[Job]", processes: set[subprocess.Popen[str]], threads: Sequence[threading.Thread]
 ) -> None:
     """Begin no other cell, and end those that train: each marks its own run KILLED."""
     with contextlib.suppress(queue.Empty):
@@ -148,36 +154,37 @@ def _stop(
         time.sleep(0.1)
 
 
-def _work(waiting: "queue.SimpleQueue[Cell]", processes: set[subprocess.Popen[str]], jobs: int) -> None:
+def _work(waiting: "queue.SimpleQueue[Job]", processes: set[subprocess.Popen[str]], jobs: int) -> None:
     """Train one waiting cell after the other."""
     while True:
         try:
             cell = waiting.get_nowait()
         except queue.Empty:
             return
+        said = {progress.FILE: str(cell.progress)} if cell.progress else {}
         process = subprocess.Popen(
             [sys.executable, "-m", "conflow", "train", *cell.arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             # Processes that share the cores would otherwise each start a thread for every core and crawl.
-            env={"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // jobs)), **os.environ},
+            env={"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // jobs)), **os.environ, **said},
             start_new_session=True,  # Ctrl-C reaches the grid alone, which then ends its cells in order
         )
         processes.add(process)
         assert process.stdout is not None
         for line in process.stdout:
-            _listen(cell, line.strip())
+            if line.strip():
+                cell.output.append(line.strip())
         cell.failed = process.wait() != 0
         processes.discard(process)
-        cell.share, cell.note = 1.0, ""
+        cell.share, cell.note, cell.progress = 1.0, "", None
 
 
-def _listen(cell: Cell, line: str) -> None:
-    """Take a cell's progress from a line that it printed."""
-    if line:
-        cell.output.append(line)
-    if found := STEPS.match(line):
-        before, share = STAGES[found[1]]
-        cell.share = before + share * int(found[2]) / int(found[3])
-        cell.note = f"{found[1]} {found[2]}/{found[3]}"
+def _look(cell: Job) -> None:
+    """Take a cell's progress from what its process says."""
+    found = progress.read(cell.progress) if cell.progress else None
+    if found and found[0] in STAGES:
+        stage, completed, total = found
+        before, share = STAGES[stage]
+        cell.share, cell.note = before + share * completed / total, f"{stage} {completed:g}/{total:g}"

@@ -7,7 +7,7 @@ from typing import Literal
 from conflow.results import statistics
 from conflow.results.records import Record
 from conflow.results.statistics import LEVEL, Difference
-from conflow.results.tables import COLLISIONS, QUALITIES, cell, scores
+from conflow.results.tables import COLLISIONS, QUALITIES, cell, collisions, scores
 from conflow.training.summary import digits
 
 Verdict = Literal["holds", "reversed", "not distinguishable", "too few seeds", "no runs"]
@@ -35,9 +35,10 @@ class Claim:
 
 def claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
     """Each as "a is lower than b"; none where there are no runs at all."""
-    if not runs:
+    if not runs or collisions(runs) is not COLLISIONS:  # a task of its own has claims of its own
         return []
-    none, *_ = COLLISIONS
+    none, robot, *_ = COLLISIONS
+    nearer = ("test/robot/energy_distance", "test/none/energy_distance")
     rates = [
         ("ConFlow collides less than FM, without guidance", "cgp", "fm", none),
         *(
@@ -52,23 +53,27 @@ def claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
         ("the spectral network lets ConFlow collide less, without guidance", "spectral", "cgp", none),
         ("plus collides less than ConFlow, without guidance", "plus", "cgp", none),
         ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
+        ("guided by descent, D+ alone collides less than plus without guidance", "descent", "plus", robot, none),
+        ("guided by descent, D+ alone is nearer to held-out D+ than plus without guidance", "descent", "plus", *nearer),
     ]
     ordered = [*rates, *((f"CGP beats Gaussian: {row}", "cgp", "gaussian", key) for key, row in others), *ours]
     return _judged([_compared(runs, *claim) for claim in ordered])
 
 
 def _compared(
-    runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str
+    runs: Mapping[str, list[Record]], text: str, lower: str, higher: str, metric: str, of_higher: str | None = None
 ) -> tuple[Claim, Difference | None, bool]:
     """A claim as it is before the test, the difference that decides it, if any, and whether that is of rates."""
     if lower not in runs or higher not in runs:
         missing = " and ".join(name for name in (lower, higher) if name not in runs)
         return _undecided(text, "no runs", f"no finished run of {missing}"), None, False
-    a, b = (cell("", "", "", None, metric, runs[name]) for name in (lower, higher))
+    metrics = {lower: metric, higher: of_higher or metric}
+    a, b = (cell("", "", "", None, key, runs[name]) for name, key in metrics.items())
     if a is None or b is None:
-        reason = f"not all runs of {lower} and {higher} have {metric.removeprefix('test/')}"
+        wanted = " and ".join(dict.fromkeys(key.removeprefix("test/") for key in metrics.values()))
+        reason = f"not all runs of {lower} and {higher} have {wanted}"
         return _undecided(text, "no runs", reason), None, False
-    between = statistics.difference(scores(metric, runs[lower]), scores(metric, runs[higher]))
+    between = statistics.difference(*(scores(key, runs[name]) for name, key in metrics.items()))
     detail = f"{digits(a.value)} against {digits(b.value)}, {a.seeds} and {b.seeds} seeds"
     if between is not None and between.pairs:
         detail += f", {between.pairs} in pairs"

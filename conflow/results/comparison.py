@@ -8,9 +8,9 @@ from conflow.results import paper, records
 from conflow.results.claims import Claim, claims
 from conflow.results.records import Record
 from conflow.results.tables import BASELINE, COLLISIONS, METHODS, Cell, labelled, labels, tables
-from conflow.tracking import code
+from conflow.tracking import code, store
 from conflow.training import config
-from conflow.training.config import SPLITS, SplitName
+from conflow.training.config import PAPERS_TASK, SPLITS, SplitName
 from conflow.training.evaluation import UNCHANGED
 
 
@@ -25,6 +25,7 @@ class Comparison:
         code: which runs are of other code than the present or, of published ones, than the others of their row.
         split: whose starts and goals the models were given; rows without a model are always of the test split.
         left_out: the names of finished runs that were not measured on it.
+        others: finished runs at the preset that are of other tasks, data or settings.
     """
 
     preset: str
@@ -37,6 +38,7 @@ class Comparison:
     code: str
     split: SplitName
     left_out: list[str]
+    others: list[str]
 
 
 def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val") -> Comparison:
@@ -49,17 +51,22 @@ def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val"
     """
     found = records.from_store(preset, arguments)
     if not found:
-        raise ConfigError(f"preset={preset}: no run at this preset has finished; try: make ablations PRESET={preset}")
+        wanted = " ".join([f"preset={preset}", *arguments])
+        others = records.others(preset, [])
+        there = f"; there are {', '.join(others[:5])}" if others else ""
+        raise ConfigError(
+            f"{wanted}: no such run has finished in {store.place()}{there}; try: make ablations PRESET={preset}"
+        )
     measured = [one.on(split) for one in found if one.measured(split)]
     if not measured:
         raise ConfigError(
             f"preset={preset}: no finished run was measured on the {SPLITS[split]} split, as those from before it was "
             f"part of a run were not; try: split=test"
         )
-    left_out = [f"{one.ablation}-s{one.seed}" for one in found if not one.measured(split)]
+    left_out = [one.name for one in found if not one.measured(split)]
     rows = _grouped(measured, lambda one: one.ablation)
     of_code = _of_other_code(one for of_row in rows.values() for one in of_row)
-    return _comparison(preset, rows, {}, of_code, split, left_out)
+    return _comparison(preset, rows, {}, of_code, split, left_out, records.others(preset, found))
 
 
 def collect_reference() -> list[Comparison]:
@@ -105,7 +112,7 @@ def _of_other_code(records: Iterable[Record]) -> str:
     runs: dict[str, list[str]] = {}
     for one in records:
         if files := code.differing(one.origin):
-            runs.setdefault(", ".join(files), []).append(f"{one.ablation}-s{one.seed}")
+            runs.setdefault(", ".join(files), []).append(one.name)
     shown = [f"{', '.join(names)} ({files})" for files, names in runs.items()]
     return f"Trained by other code than the present: {'; '.join(shown)}" if shown else ""
 
@@ -130,6 +137,7 @@ def _comparison(
     of_code: str,
     split: SplitName,
     left_out: list[str],
+    others: Sequence[str] = (),
 ) -> Comparison:
     cells = tables(runs, readings)
     rows = dict(runs) | dict(readings)
@@ -145,6 +153,7 @@ def _comparison(
         of_code,
         split,
         left_out,
+        list(others),
     )
 
 
@@ -172,7 +181,7 @@ def _commands(
         for label in labels(of_row):
             seeds = " ".join(str(one.seed) for one in labelled(of_row, label))
             arguments = "" if label == UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
-            run = f"{of_row[0].preset}/{ablation}-s$s"
+            run = f"{of_row[0].preset}/{of_row[0].name.rpartition('-s')[0]}-s$s"
             evaluated = f"for s in {seeds}; do make evaluate RUN={run} SPLIT={split}{arguments}; done"
             found[f"{name}, {label}"] = f"{again} && {evaluated}"
     if "cgp" in runs:
@@ -188,4 +197,6 @@ def _command(runs: Sequence[Record]) -> str:
     # Without the spaces of a list, at which the shell would cut it.
     changes = [change.replace(", ", ",") for change in one.changes]
     arguments = f" ARGS='{' '.join(changes)}'" if changes else ""
+    if one.task != PAPERS_TASK:
+        arguments = f" TASK={one.task if one.of_task else f'{one.task}.py'}{arguments}"
     return f'make ablations ABLATIONS={one.ablation} SEEDS="{seeds}" PRESET={one.preset}{arguments}'

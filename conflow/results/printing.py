@@ -19,6 +19,10 @@ from conflow.training.config import SPLITS
 from conflow.training.summary import digits
 
 AGAIN = "again with"
+HEADLINE = ("cgp", "no_negatives", "fm", "fm_mixed", "gaussian", "gp", "plus")
+"""The ablations of the first table that people see."""
+MOST_OTHERS = 6
+"""Runs of other settings that are named; there may be hundreds."""
 Format = Literal["table", "markdown", "csv", "json"]
 Sheet = tuple[str, list[str], list[list[str]]]
 """Title, header and rows of a table, as text."""
@@ -83,6 +87,10 @@ def _reservations(comparison: Comparison) -> list[str]:
     if comparison.left_out:
         runs = ", ".join(comparison.left_out)
         found.append(f"Not measured on the {SPLITS[comparison.split]} split, and left out: {runs}; try: split=test")
+    if comparison.others:
+        shown, more = ", ".join(comparison.others[:MOST_OTHERS]), len(comparison.others) - MOST_OTHERS
+        rest = f" and {more} more" if more > 0 else ""
+        found.append(f"Finished too, of other tasks, data or settings: {shown}{rest}. Compare them by their own ARGS")
     return found
 
 
@@ -114,7 +122,7 @@ def csv_text(kind: Any, rows: Iterable[Any]) -> str:
 
 
 def _overview(comparisons: Sequence[Comparison]) -> Sheet:
-    """The first column of Table 1 at every preset that has one."""
+    """The first column of Table 1 at every preset that has one: the paper's methods and what is best beyond them."""
     none = next(iter(COLLISIONS.values()))
     cells = {
         (cell.row, one.preset): cell
@@ -124,7 +132,7 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
     }
     presets = list(dict.fromkeys(preset for _, preset in cells))
     rows = []
-    for method in dict.fromkeys([*METHODS.values(), *(row for row, _ in cells)]):
+    for method in [METHODS[ablation] for ablation in HEADLINE]:
         of_row = [cells.get((method, preset)) for preset in presets]
         if any(of_row):
             paper = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")

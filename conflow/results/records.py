@@ -12,7 +12,7 @@ from mlflow.entities import Run
 from conflow.errors import ConfigError
 from conflow.tracking import code, recording, store
 from conflow.training import config
-from conflow.training.config import SPLITS, SplitName, flatten
+from conflow.training.config import PAPERS_TASK, SPLITS, SplitName, flatten
 from conflow.training.evaluation import EVALUATED_ON_VALIDATION
 
 FOLDER = store.RUNS / "reference" / "runs"
@@ -71,8 +71,9 @@ class Record:
 
     def write(self, folder: Path) -> Path:
         """The file of this record in a folder; where one of another run of the same experiment was, it is replaced."""
+        parts = [*([] if self.task == PAPERS_TASK else [self.task]), self.ablation, self.preset, *self.changes]
         # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
-        name = re.sub(r"[^\w.=+-]+", "_", "-".join([self.ablation, self.preset, *self.changes, f"s{self.seed}"]))
+        name = re.sub(r"[^\w.=+-]+", "_", "-".join([*parts, f"s{self.seed}"]))
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{name}.json"
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
@@ -94,12 +95,29 @@ class Record:
                 metrics[VALIDATED[of_validation] + key.removeprefix(of_validation)] = value
         return replace(self, metrics=metrics)
 
+    @property
+    def task(self) -> str:
+        """The task's name; runs from before there were several are of the paper's."""
+        return self.settings.get("task", PAPERS_TASK)
+
+    @property
+    def name(self) -> str:
+        """The run's."""
+        own = f"{self.ablation}-s{self.seed}"
+        return own if self.task == PAPERS_TASK else f"{self.task}-{own}"
+
     @cached_property
     def changes(self) -> list[str]:
-        """The settings that are not those of the ablation at the preset, as arguments."""
-        named = flatten(config.load([f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]).tree())
+        """The settings that are not those of the task and the ablation at the preset, as arguments."""
+        axes = [f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]
+        named = flatten(config.load([*axes, *self.of_task]).tree()) | {"task": self.task}
         changed = {key: value for key, value in self.settings.items() if value != str(named.get(key, value))}
         return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
+
+    @property
+    def of_task(self) -> list[str]:
+        """The argument that chooses the task, where it is one that has a name here."""
+        return [f"task={self.task}"] if self.task in config.names("task") else []
 
 
 def finished(preset: str) -> list[Run]:
@@ -121,6 +139,22 @@ def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
         if run.data.tags["config_sha"] == asked.sha():
             newest.setdefault((ablation, seed), Record.of(run))
     return sorted(newest.values(), key=lambda record: record.seed)
+
+
+def others(preset: str, shown: Sequence[Record]) -> list[str]:
+    """The finished runs at a preset that are of other tasks, data or settings than those shown, by name and change."""
+    ids = {run.run_id for run in shown}
+    known = {(run.ablation, run.seed, str(run.settings)) for run in shown}
+    found: dict[str, None] = {}
+    for run in store.runs("FINISHED", preset=preset):
+        one = Record.of(run)
+        if one.run_id in ids or (one.ablation, one.seed, str(one.settings)) in known:
+            continue
+        try:
+            found[" ".join([one.name, *one.changes])] = None
+        except ConfigError:
+            found[one.name] = None
+    return list(found)
 
 
 def from_files() -> list[Record]:

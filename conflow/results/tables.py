@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -9,6 +10,7 @@ from statistics import fmean
 from conflow.results import paper, statistics
 from conflow.results.records import Record
 from conflow.results.statistics import Score, Seed
+from conflow.training.config import PAPERS_TASK
 from conflow.training.metrics import wilson
 
 METHODS = {
@@ -25,6 +27,7 @@ METHODS = {
     "fitted": "fitted source",
     "end": "correction at the predicted end",
     "few_steps": "few solver steps",
+    "descent": "descent at sampling, none in training",
     "plus": "plus: the best together",
 }
 BASELINE = "no model: "
@@ -56,6 +59,7 @@ SMOOTHNESS = {
 GUARDS = {
     "test/none/robot_collision": "robot-collision rate",
     "test/none/energy_distance": "energy distance to held-out D+",
+    "test/robot/energy_distance": "robot: energy distance to held-out D+",
     "test/none/diversity": "diversity",
     "test/none/smoothness_median": "smoothness, median",
     "test/none/path_length_median": "path length, median",
@@ -75,6 +79,7 @@ ELSEWHERE = {
     "test/none/near": "near rate",
     "test/none/smoothness_median": "smoothness, median",
     "test/none/energy_distance": "energy distance to held-out D+",
+    "test/robot/energy_distance": "robot: energy distance to held-out D+",
 }
 READINGS = {
     "none/robot_collision": "none: robot",
@@ -149,17 +154,31 @@ def tables(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]
     return [cell for cell in cells if cell is not None]
 
 
+def collisions(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
+    """The columns of collision rates: the paper's, or of a task of its own each setting with each constraint."""
+    every = [run for by_seed in runs.values() for run in by_seed]
+    if not every or every[0].of_task:  # the tasks that come with the program have the paper's constraints
+        return COLLISIONS
+    found = (re.fullmatch(r"test/([^/]+)/(.+)_collision_count", key) for run in every for key in run.metrics)
+    names = sorted({(one[1] != "none", one[1], one[2]) for one in found if one})
+    return {f"test/{setting}/{name}_collision": f"{setting}: {name}" for _, setting, name in names}
+
+
 def _table_1(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     cells = []
+    columns = collisions(runs)
     for ablation, by_seed in runs.items():
-        printed = itertools.chain(paper.TABLE_1.get(ablation, ()), itertools.repeat(None))
-        for (metric, column), number in zip(COLLISIONS.items(), printed, strict=False):
+        of_paper = by_seed[0].task == PAPERS_TASK
+        printed = itertools.chain(paper.TABLE_1.get(ablation, ()) if of_paper else (), itertools.repeat(None))
+        for (metric, column), number in zip(columns.items(), printed, strict=False):
             cells.append(cell("1", METHODS.get(ablation, ablation), column, number, metric, by_seed))
-    return cells + _without_model("1", COLLISIONS, runs)
+    return cells + _without_model("1", columns, runs)
 
 
 def _table_2(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
-    cells = []
+    cells: list[Cell | None] = []
+    if collisions(runs) is not COLLISIONS:
+        return cells
     for ablation in [name for name in paper.TABLE_2 if name in runs]:
         printed = itertools.chain(paper.TABLE_2[ablation], itertools.repeat(None))
         for (metric, row), number in zip((QUALITIES | SMOOTHNESS).items(), printed, strict=False):

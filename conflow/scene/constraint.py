@@ -4,36 +4,44 @@ This file is the only notion of "collision": the label M(x_1) of the data, the m
 that corrects and guides, and the metrics all come from the same `clearance`.
 """
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import Literal, cast
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from conflow.scene.robots import PointRobots
+from conflow.scene.robots import Robots
+from conflow.scene.settings import BarrierShape, Obstacle, Pairs, Reduction
 
-BarrierShape = Literal["softplus", "relu"]
-Reduction = Literal["sum", "mean", "closest"]
 SHARED = 1e-12
 """Two bodies that are nearer share a point."""
+PARTS = 8
+"""Into which a trajectory is divided between two waypoints, where a constraint knows no better."""
+
+Pullback = Callable[[Tensor], Tensor]
+"""Of weights g (batch, T, n) on clearances to the gradient of sum g c with respect to x, (batch, T, D)."""
 
 
 @dataclass(frozen=True)
 class Barrier:
-    """The barrier as a function of the clearance c = d - r, and where along the trajectory it is taken.
+    """The barrier as a function of the clearances c = d - r, and which of them count.
 
     softplus: C_gamma = -1/gamma log(1 + exp(-gamma c)) (Eq. c). relu: C = min(c, 0), its limit for large gamma.
     Reduction "sum" and "mean" are over the waypoints; "closest" takes C at the closest approach alone. The paper
-    leaves open which of them it means.
+    leaves open which of them it means. Of the clearances at a waypoint the smallest counts, or all do.
+
+    >>> Barrier("relu").total(torch.tensor([[[0.1, -0.2], [-0.3, -0.1]]]))
+    tensor([-0.5000])
     """
 
     shape: BarrierShape = "softplus"
     reduction: Reduction = "sum"
     gamma: float = 10.0
+    pairs: Pairs = "nearest"
 
     def value(self, c: Tensor) -> Tensor:
         """C at clearance c."""
@@ -43,52 +51,127 @@ class Barrier:
         """dC/dc at clearance c."""
         return torch.sigmoid(-self.gamma * c) if self.shape == "softplus" else (c < 0).to(c.dtype)
 
+    def total(self, c: Tensor) -> Tensor:
+        """C of trajectories with clearances c (batch, T, n), (batch,)."""
+        if self.pairs == "all":
+            return self._weight(c) * self.value(c).sum(dim=(1, 2))
+        return self._weight(c) * self.value(self._candidates(c).min(dim=2).values).sum(dim=1)
 
-@dataclass(frozen=True)
-class Obstacle:
-    """A disc that the robots must not touch: centre (x, y) and radius, in workspace units."""
+    def slopes(self, c: Tensor) -> Tensor:
+        """dC/dc of the same, (batch, T, n)."""
+        if self.pairs == "all":
+            return self._weight(c) * self.slope(c)
+        candidates = self._candidates(c)
+        nearest = candidates.min(dim=2, keepdim=True)
+        slope = self._weight(c) * self.slope(nearest.values)
+        return torch.zeros_like(candidates).scatter(2, nearest.indices, slope).view_as(c)
 
-    x: float = 0.0
-    y: float = 0.5
-    radius: float = 0.1
+    def _weight(self, c: Tensor) -> float:
+        """What C at one waypoint counts for in C of the trajectory."""
+        return 1 / c.shape[1] if self.reduction == "mean" else 1
+
+    def _candidates(self, c: Tensor) -> Tensor:
+        """Clearances arranged so that each row's smallest one counts: (batch, T, n) or (batch, 1, T n)."""
+        return c.flatten(1)[:, None] if self.reduction == "closest" else c
 
 
 class Constraint(nn.Module, ABC):
-    """Clearance, barrier, gradient and violation of trajectories x (batch, T, D)."""
+    """What trajectories x (batch, T, D) of some robots must keep: `clearance` says by how much they do.
+
+    The rest follows from it. Where a constraint knows a closed form it overrides: several `clearances` a waypoint in
+    place of the smallest, their `vjp` in place of automatic differentiation, `swept_clearance` in place of subdivision.
+
+    Attributes:
+        robots: what moves.
+        shape: C as a function of the clearances.
+    """
+
+    def __init__(self, robots: Robots) -> None:
+        super().__init__()
+        self.robots, self.shape = robots, Barrier()
 
     @abstractmethod
     def clearance(self, x: Tensor) -> Tensor:
-        """c = d - r at every waypoint, (batch, T): the gap between the nearest bodies, negative in collision."""
+        """c = d - r at every waypoint, (batch, T): the gap between the nearest bodies, negative in violation."""
 
-    @abstractmethod
+    def clearances(self, x: Tensor) -> Tensor:
+        """All that are known at every waypoint, (batch, T, n), such as one for every pair of bodies."""
+        return self.clearance(x)[..., None]
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        """The clearances c(x), (batch, T, n), and what turns weights g on them into the gradient of sum g c."""
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            c = self.clearances(x)
+        return c.detach(), lambda g: torch.autograd.grad(c, x, g.to(c.dtype))[0]
+
     def swept_clearance(self, x: Tensor) -> Tensor:
-        """The smallest c while all bodies move straight from each waypoint to the next, (batch, T - 1).
+        """The smallest c while x goes straight from each waypoint to the next, (batch, T - 1).
 
-        Never above the clearance of the two waypoints, and below it where bodies pass each other in between.
+        Never above the clearance of the two waypoints, and below it where bodies pass each other in between. Here it is
+        the smallest of PARTS + 1 evenly spaced points.
         """
+        tau = torch.arange(PARTS, dtype=x.dtype, device=x.device)[:, None] / PARTS
+        between = torch.lerp(x[:, :-1, None], x[:, 1:, None], tau).flatten(1, 2)
+        return self.clearance(torch.cat([between, x[:, -1:]], dim=1)).unfold(1, PARTS + 1, PARTS).amin(dim=2)
 
-    @abstractmethod
     def barrier(self, x: Tensor) -> Tensor:
         """C(x), (batch,): about 0 where feasible, negative where not."""
+        return self.shape.total(self.clearances(x))
 
-    @abstractmethod
     def gradient(self, x: Tensor) -> Tensor:
-        """grad C(x) in closed form, (batch, T, D): points away from the collision."""
+        """grad C(x), (batch, T, D): points away from the violation."""
+        c, pullback = self.vjp(x)
+        return pullback(self.shape.slopes(c))
 
     def violation(self, x: Tensor) -> Tensor:
-        """M(x), boolean (batch,): some waypoint is in collision, or is not a number."""
+        """M(x), boolean (batch,): some waypoint is in violation, or is not a number."""
         return ~(self.clearance(x).amin(dim=1) >= 0)
+
+    def shaped(self, shape: Barrier, margin: float = 0.0) -> "Constraint":
+        """The same constraint with another barrier, and with all clearances smaller by a margin."""
+        made = copy.deepcopy(self)
+        made.shape = shape
+        return made.narrowed(margin) if margin else made
+
+    def narrowed(self, margin: float) -> "Constraint":
+        """The same with all clearances smaller by a margin."""
+        return Narrowed(self, margin)
+
+
+class Narrowed(Constraint):
+    """A constraint of which a margin more is kept."""
+
+    def __init__(self, constraint: Constraint, margin: float) -> None:
+        super().__init__(constraint.robots)
+        self.constraint, self.margin, self.shape = constraint, margin, constraint.shape
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return self.constraint.clearance(x) - self.margin
+
+    def clearances(self, x: Tensor) -> Tensor:
+        return self.constraint.clearances(x) - self.margin
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        c, pullback = self.constraint.vjp(x)
+        return c - self.margin, pullback
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        return self.constraint.swept_clearance(x) - self.margin
 
 
 class Sum(Constraint):
     """Several constraints at once: barriers add up, the clearance is the smallest."""
 
     def __init__(self, terms: Sequence[Constraint]) -> None:
-        super().__init__()
+        super().__init__(terms[0].robots)
         self.terms = cast(Sequence[Constraint], nn.ModuleList(terms))
 
     def clearance(self, x: Tensor) -> Tensor:
         return torch.stack([term.clearance(x) for term in self.terms]).amin(dim=0)
+
+    def clearances(self, x: Tensor) -> Tensor:
+        return torch.cat([term.clearances(x) for term in self.terms], dim=2)
 
     def swept_clearance(self, x: Tensor) -> Tensor:
         return torch.stack([term.swept_clearance(x) for term in self.terms]).amin(dim=0)
@@ -99,34 +182,46 @@ class Sum(Constraint):
     def gradient(self, x: Tensor) -> Tensor:
         return torch.stack([term.gradient(x) for term in self.terms]).sum(dim=0)
 
+    def shaped(self, shape: Barrier, margin: float = 0.0) -> Constraint:
+        return Sum([term.shaped(shape, margin) for term in self.terms])
+
 
 class Avoidance(Constraint):
     """Pairs of bodies that keep their distance: body points p, separations w = A p - b, clearances |w| - r.
 
     Args:
-        robots: places the body points, `bodies` of them over all robots.
+        robots: places the body points.
         incidence: A, (pairs, bodies).
-        offset: b, (pairs, 2).
-        radius: r, (pairs,): the distance at which a pair touches.
-        barrier: C as a function of the clearance.
+        offset: b, (pairs, 2 or 3).
+        radius: r, float64 (pairs,): the distance at which a pair touches.
     """
 
     incidence: Tensor
     offset: Tensor
     radius: Tensor
 
-    def __init__(
-        self, robots: PointRobots, incidence: Tensor, offset: Tensor, radius: Tensor, barrier: Barrier
-    ) -> None:
-        super().__init__()
-        self.robots = robots
-        self.shape = barrier
+    def __init__(self, robots: Robots, incidence: Tensor, offset: Tensor, radius: Tensor) -> None:
+        super().__init__(robots)
+        self.touching = radius
         self.register_buffer("incidence", incidence, persistent=False)
         self.register_buffer("offset", offset, persistent=False)
-        self.register_buffer("radius", radius, persistent=False)
+        self.register_buffer("radius", radius.to(torch.get_default_dtype()), persistent=False)
 
     def clearance(self, x: Tensor) -> Tensor:
-        return self._pairs(x)[2].amin(dim=2)
+        return self.clearances(x).amin(dim=2)
+
+    def clearances(self, x: Tensor) -> Tensor:
+        return self._pairs(x)[2]
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        w, d, c = self._pairs(x)
+
+        def pullback(g: Tensor) -> Tensor:
+            # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
+            dC_dw = (g / d.clamp_min(SHARED))[..., None] * w
+            return self.robots.pullback(x, self.incidence.to(w.dtype).mT @ dC_dw)
+
+        return c, pullback
 
     def swept_clearance(self, x: Tensor) -> Tensor:
         # The separation goes straight too, w(tau) = w + tau u, and is shortest at tau = -<w, u> / |u|^2.
@@ -139,85 +234,135 @@ class Avoidance(Constraint):
         # Rounding must not put the closest approach farther away than the ends.
         return torch.minimum(nearest, torch.minimum(c[:, :-1], c[:, 1:])).amin(dim=2)
 
-    def barrier(self, x: Tensor) -> Tensor:
-        return self._weight(x) * self.shape.value(self._candidates(self._pairs(x)[2]).min(dim=2).values).sum(dim=1)
-
-    def gradient(self, x: Tensor) -> Tensor:
-        w, d, c = self._pairs(x)
-        candidates = self._candidates(c)
-        nearest = candidates.min(dim=2, keepdim=True)
-        slope = self._weight(x) * self.shape.slope(nearest.values)
-        dC_dc = torch.zeros_like(candidates).scatter(2, nearest.indices, slope).view_as(c)
-        # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
-        dC_dw = (dC_dc / d.clamp_min(SHARED))[..., None] * w
-        return self.robots.pullback(self.incidence.to(w.dtype).mT @ dC_dw)
+    def narrowed(self, margin: float) -> Constraint:
+        made = Avoidance(self.robots, self.incidence, self.offset, self.touching + margin)
+        made.shape = self.shape
+        return made
 
     def _pairs(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Separations w (batch, T, pairs, 2), distances d = |w| and clearances c = d - r, both (batch, T, pairs)."""
-        p = self.robots.points(x).flatten(2, 3)
-        w = torch.einsum("pn,btnk->btpk", self.incidence.to(x.dtype), p) - self.offset
+        """Separations w (batch, T, pairs, 2 or 3), distances d = |w| and clearances c = d - r, (batch, T, pairs)."""
+        w = torch.einsum("pn,btnk->btpk", self.incidence.to(x.dtype), self.robots.points(x)) - self.offset
         d = torch.linalg.vector_norm(w, dim=3)
         return w, d, d - self.radius
 
-    def _weight(self, x: Tensor) -> float:
-        """What C at one waypoint counts for in C of the trajectory."""
-        return 1 / x.shape[1] if self.shape.reduction == "mean" else 1
-
-    def _candidates(self, c: Tensor) -> Tensor:
-        """Clearances arranged so that each row's smallest one counts: (batch, T, pairs) or (batch, 1, T pairs)."""
-        return c.flatten(1)[:, None] if self.shape.reduction == "closest" else c
-
 
 class RobotAvoidance(Avoidance):
-    """Every two robots keep the distance `radius` between their centres."""
+    """No body of a robot touches one of another robot: their centres keep the sum of their radii.
 
-    def __init__(self, robots: PointRobots, radius: float = 0.3, barrier: Barrier | None = None) -> None:
-        bodies = torch.eye(robots.count)
-        pairs = list(combinations(range(robots.count), 2))
-        incidence = torch.stack([bodies[i] - bodies[j] for i, j in pairs])
-        super().__init__(
-            robots, incidence, torch.zeros(len(pairs), 2), torch.full((len(pairs),), radius), barrier or Barrier()
-        )
+    >>> from conflow.scene.robots import Discs
+    >>> x = torch.tensor([[[0.0, 0.0, 0.5, 0.0]]])  # two discs, half a unit apart
+    >>> RobotAvoidance(Discs(2, radius=[0.125, 0.25])).clearance(x).item()
+    0.125
+
+    Raises:
+        ValueError: there is one robot alone.
+    """
+
+    def __init__(self, robots: Robots) -> None:
+        if robots.count < 2:
+            raise ValueError("one robot: expected two or more that avoid each other")
+        i, j = torch.triu_indices(len(robots.owner), len(robots.owner), 1)
+        others = robots.owner[i] != robots.owner[j]
+        i, j, bodies = i[others], j[others], torch.eye(len(robots.owner))
+        super().__init__(robots, bodies[i] - bodies[j], torch.zeros(len(i), 2), robots.radii[i] + robots.radii[j])
 
 
 class ObstacleAvoidance(Avoidance):
-    """Every robot, a disc of `robot_radius`, stays clear of every obstacle."""
+    """Every body stays clear of every obstacle.
 
-    def __init__(
-        self, robots: PointRobots, obstacles: Sequence[Obstacle], robot_radius: float, barrier: Barrier | None = None
-    ) -> None:
-        incidence = torch.eye(robots.count).repeat_interleave(len(obstacles), dim=0)
-        offset = torch.tensor([[o.x, o.y] for o in obstacles]).repeat(robots.count, 1)
-        radius = torch.tensor([robot_radius + o.radius for o in obstacles]).repeat(robots.count)
-        super().__init__(robots, incidence, offset, radius, barrier or Barrier())
+    >>> from conflow.scene.robots import Discs
+    >>> near = ObstacleAvoidance(Discs(1, radius=0.25), [Obstacle(0.0, 1.0, 0.25)])
+    >>> near.clearance(torch.zeros(1, 1, 2)).item()
+    0.5
+    """
+
+    def __init__(self, robots: Robots, obstacles: Sequence[Obstacle]) -> None:
+        bodies, among = len(robots.owner), len(obstacles)
+        incidence = torch.eye(bodies).repeat_interleave(among, dim=0)
+        offset = torch.tensor([[o.x, o.y] for o in obstacles]).repeat(bodies, 1)
+        radius = torch.tensor([o.radius for o in obstacles], dtype=torch.float64).repeat(bodies)
+        super().__init__(robots, incidence, offset, robots.radii.repeat_interleave(among) + radius)
 
 
 class Workspace(Constraint):
-    """Every robot's position stays in [-1, 1]^2, and `margin` away from its walls: c = 1 - margin - |p|.
+    """Every body's centre stays within [-1, 1] on every axis: c = 1 - |p|.
 
     Each wall counts for itself, at every waypoint: a robot in a corner is pushed away from both.
     """
 
-    def __init__(self, robots: PointRobots, margin: float = 0.0, barrier: Barrier | None = None) -> None:
-        super().__init__()
-        self.robots, self.margin, self.shape = robots, margin, barrier or Barrier()
+    def __init__(self, robots: Robots, margin: float = 0.0) -> None:
+        super().__init__(robots)
+        self.margin, self.shape = margin, replace(self.shape, pairs="all")
 
     def clearance(self, x: Tensor) -> Tensor:
-        return self._walls(x)[1].amin(dim=2)
+        return self.clearances(x).amin(dim=2)
+
+    def clearances(self, x: Tensor) -> Tensor:
+        return 1 - self.margin - self.robots.points(x).flatten(2).abs()
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        p = self.robots.points(x)
+        c = 1 - self.margin - p.flatten(2).abs()
+        return c, lambda g: self.robots.pullback(x, -p.sign() * g.unflatten(2, p.shape[2:]))
 
     def swept_clearance(self, x: Tensor) -> Tensor:
-        # A square is convex, so between two points inside nothing is nearer to a wall than one of them.
+        # A box is convex, so between two points inside nothing is nearer to a wall than one of them.
         c = self.clearance(x)
         return torch.minimum(c[:, :-1], c[:, 1:])
 
-    def barrier(self, x: Tensor) -> Tensor:
-        return self.shape.value(self._walls(x)[1]).sum(dim=(1, 2))
+    def shaped(self, shape: Barrier, margin: float = 0.0) -> Constraint:
+        made = Workspace(self.robots, self.margin + margin)
+        made.shape = replace(shape, reduction="sum", pairs="all")
+        return made
 
-    def gradient(self, x: Tensor) -> Tensor:
-        p, c = self._walls(x)
-        return self.robots.pullback((-p.sign() * self.shape.slope(c)).unflatten(2, (-1, 2)))
 
-    def _walls(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Coordinates p of all body points and their clearances, both (batch, T, 2 bodies)."""
-        p = self.robots.points(x).flatten(2)
-        return p, 1 - self.margin - p.abs()
+class SpeedLimit(Constraint):
+    """No body moves faster than `limit`: c = limit - |p_{i+1} - p_i| / dt, in workspace units per second.
+
+    At a waypoint the faster of the two steps beside it counts. A trajectory is straight between waypoints, so its speed
+    there is that of the step.
+
+    Args:
+        robots: what moves.
+        limit: the largest speed, in workspace units per second.
+        dt: seconds from one waypoint to the next, the task's `dt`.
+    """
+
+    def __init__(self, robots: Robots, limit: float, dt: float) -> None:
+        super().__init__(robots)
+        self.limit, self.dt = limit, dt
+
+    def clearance(self, x: Tensor) -> Tensor:
+        c = self.swept_clearance(x)
+        return torch.minimum(torch.cat([c[:, :1], c], dim=1), torch.cat([c, c[:, -1:]], dim=1))
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        step = self.robots.points(x).diff(dim=1)
+        # Not linalg.vector_norm: its gradient at a robot that stands still is not a number on every version.
+        return self.limit - (step.square().sum(dim=3) + SHARED**2).sqrt().amax(dim=2) / self.dt
+
+
+class AccelerationLimit(Constraint):
+    """No body accelerates more than `limit`: c = limit - |p_{i+1} - 2 p_i + p_{i-1}| / dt^2.
+
+    In workspace units per second squared; start and goal count as the waypoint beside them. Velocities jump at
+    waypoints, so between two of them the smaller clearance of both stands.
+
+    Args:
+        robots: what moves.
+        limit: the largest acceleration.
+        dt: seconds from one waypoint to the next, the task's `dt`.
+    """
+
+    def __init__(self, robots: Robots, limit: float, dt: float) -> None:
+        super().__init__(robots)
+        self.limit, self.dt = limit, dt
+
+    def clearance(self, x: Tensor) -> Tensor:
+        second = self.robots.points(x).diff(dim=1).diff(dim=1)
+        c = self.limit - (second.square().sum(dim=3) + SHARED**2).sqrt().amax(dim=2) / self.dt**2
+        return torch.cat([c[:, :1], c, c[:, -1:]], dim=1)
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        c = self.clearance(x)
+        return torch.minimum(c[:, :-1], c[:, 1:])

@@ -12,7 +12,8 @@ DECISIVE = (
     "scene/**/*.py",  # the world, and the demonstrations of it
     "training/build.py",  # what a setting's name stands for, and every random number
     "training/datamodule.py",  # labels, splits and batches
-    "training/module.py",  # loss, optimiser and sampling
+    "training/model.py",  # loss and sampling
+    "training/module.py",  # and its optimiser
     "training/train.py",  # the loop, and what comes in which order
     "training/callbacks.py",  # what is measured during training
     "training/evaluation.py",  # what is sampled for validation and test
@@ -35,6 +36,18 @@ def files(package: Path = PACKAGE) -> Mapping[str, str]:
     """
     paths = sorted(path for pattern in DECISIVE for path in package.glob(pattern))
     return {path.relative_to(package).as_posix(): _sha(executed(ast.parse(path.read_bytes())))[:8] for path in paths}
+
+
+def of_file(path: Path) -> str:
+    """The digest of one more file that decides numbers, such as a user's task; of a broken one, of its text."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return "none"
+    try:
+        return _sha(executed(ast.parse(content)))[:8]
+    except (SyntaxError, ValueError):
+        return hashlib.sha256(content).hexdigest()[:8]
 
 
 def executed(node: object) -> str:

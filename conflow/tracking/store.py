@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import socket
 import sqlite3
 from collections.abc import Sequence
@@ -42,6 +43,17 @@ def store_uri() -> str:
     return os.environ.get("MLFLOW_TRACKING_URI") or local_uri()
 
 
+def place() -> str:
+    """The store, as messages name it: its address without a password, or the file."""
+    uri = store_uri()
+    return str(RUNS / "mlflow.db") if uri == local_uri() else re.sub(r"(?<=//)[^/@\s]+@", "", uri)
+
+
+def exists() -> bool:
+    """Whether there is a store, of which to ask something: a question does not make one."""
+    return store_uri() != local_uri() or (RUNS / "mlflow.db").exists()
+
+
 def client() -> MlflowClient:
     """A client of the store, which is made together with the experiment where it is missing.
 
@@ -69,6 +81,8 @@ def client() -> MlflowClient:
 
 def runs(status: str | None = None, **tags: str) -> list[Run]:
     """The runs of a status, or of any, with these tags, the newest first."""
+    if not exists():
+        return []
     store = client()
     experiment = store.get_experiment_by_name(EXPERIMENT)
     assert experiment is not None
@@ -156,7 +170,7 @@ def find_run(wanted: str) -> Run:
     raise ConfigError(
         f"run={wanted}: no such finished run, {expected(wanted, finished)}"
         if finished
-        else f"run={wanted}: no run has finished yet, expected one; try: make train"
+        else f"run={wanted}: no run has finished yet in {place()}, expected one; try: make train"
     )
 
 

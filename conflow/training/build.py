@@ -1,28 +1,120 @@
 """From settings to the objects of `flow/` and `scene/`: the one place where a name becomes a class."""
 
 import hashlib
+import importlib.util
+import inspect
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from conflow import errors
+from conflow.errors import ConfigError, brief
+from conflow.flow import settings as of_flow
 from conflow.flow import source
 from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
 from conflow.flow.network import ResMLP, SpectralMLP
 from conflow.flow.source import Source
-from conflow.scene.constraint import Barrier, Constraint, ObstacleAvoidance, RobotAvoidance, Sum, Workspace
-from conflow.scene.robots import PointRobots
+from conflow.scene.constraint import Barrier, Constraint, Sum, Workspace
+from conflow.scene.task import Task
+from conflow.scene.tasks import TASKS
 from conflow.training import config
 from conflow.training.config import Config
 
 
-def build_source(settings: config.Source, T: int) -> Source:
+def build_task(settings: Config, T: int | None = None, D: int = 4) -> Task:
+    """The task of these settings.
+
+    Args:
+        settings: of the experiment.
+        T: waypoints, where the demonstrations have them and not the settings.
+        D: numbers of a configuration, likewise.
+
+    Raises:
+        ConfigError: it is a file of which no task can be had.
+    """
+    if config.is_file(settings.task):
+        return task_of_file(Path(settings.task))
+    return TASKS[settings.task](
+        T or settings.data.horizon,
+        D,
+        settings.constraint.radius,
+        settings.sample.obstacle,
+        settings.sample.radius,
+        settings.data.amplitudes,
+        settings.data.jitter,
+    )
+
+
+def task_of_file(path: Path) -> Task:
+    """The task that a Python file defines: runs the file, and makes its one subclass of `Task`, without arguments.
+
+    Raises:
+        ConfigError: there is no such file, it fails, or it has none or several.
+    """
+    if not path.is_file():
+        raise ConfigError(f"task={brief(path)}: no such file, expected a Python file that defines a Task")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+        found = [
+            kind
+            for kind in vars(module).values()
+            if isinstance(kind, type) and issubclass(kind, Task) and kind.__module__ == path.stem
+        ]
+        if len(found) != 1:
+            names = ", ".join(kind.__name__ for kind in found) or "none"
+            raise ConfigError(f"task={brief(path)}: expected one class that is a conflow.Task, found {names}")
+        if missing := sorted(getattr(found[0], "__abstractmethods__", ())):
+            raise ConfigError(f"task={brief(path)}: expected {found[0].__name__} to define {', '.join(missing)}")
+        task: Task = found[0]()
+    except ConfigError:
+        raise
+    except Exception as error:  # somebody else's code may fail in any way
+        raise ConfigError(f"task={brief(path)}: {type(error).__name__}: {brief(error)}") from error
+    return checked(task, brief(path))
+
+
+def checked(task: Task, name: str) -> Task:
+    """A task, as it came, if it has what every task has.
+
+    Raises:
+        ConfigError: what it lacks.
+    """
+    if not hasattr(task, "robots"):
+        raise ConfigError(f"task={name}: expected an attribute robots, such as conflow.Discs(count=1, radius=0.05)")
+    known = {*task.constraints(), *task.constraints_at_inference()}
+    if not task.constraints():
+        raise ConfigError(f"task={name}: expected a constraint in constraints(), found none")
+    for setting, guided in task.settings().items():
+        for constraint in guided:
+            if constraint not in known:
+                expected = f"expected names of constraints, {', '.join(sorted(known))}"
+                raise ConfigError(f"task={name}: setting {setting} guides around {constraint}, {expected}")
+    if "none" in task.settings() or any("/" in one for one in (*known, *task.settings())):
+        raise ConfigError(f"task={name}: expected names without a slash, and no setting named none")
+    return task
+
+
+def file_of(task: Task) -> str:
+    """The file that defines a task, or its name with .py where there is none, as in a notebook."""
+    try:
+        path = Path(inspect.getfile(type(task)))
+    except (OSError, TypeError):
+        return f"{task.name}.py"
+    return str(path) if path.suffix == ".py" and path.is_file() else f"{task.name}.py"
+
+
+def build_source(chosen: of_flow.Source, T: int) -> Source:
     """The source p_0 on T waypoints."""
-    if settings.kind == "gaussian":
-        return source.gaussian(T, settings.modes)
-    process = source.cgp if settings.kind == "cgp" else source.gp
-    return process(T, settings.length_scale, settings.sigma_f, settings.epsilon, settings.modes)
+    if chosen.kind == "gaussian":
+        return source.gaussian(T, chosen.modes)
+    process = source.cgp if chosen.kind == "cgp" else source.gp
+    return process(T, chosen.length_scale, chosen.sigma_f, chosen.epsilon, chosen.modes)
 
 
 def fitted(settings: Config, demonstrations: Tensor) -> Config:
@@ -37,62 +129,54 @@ def fitted(settings: Config, demonstrations: Tensor) -> Config:
     try:
         length_scale, sigma_f = source.fit_rbf(demonstrations, index, settings.source.epsilon)
     except ValueError as error:
-        raise errors.ConfigError(f"source.fit=True: {error}") from None
+        raise ConfigError(f"source.fit=True: {error}") from None
     return replace(settings, source=replace(settings.source, length_scale=length_scale, sigma_f=sigma_f))
 
 
-def judged_radius(settings: Config) -> float:
-    """The distance of two robots' centres below which samples count as robot collisions."""
-    return settings.sample.radius or settings.constraint.radius
+def barrier(settings: Config) -> Barrier:
+    """C as a function of the clearances."""
+    constraint = settings.constraint
+    return Barrier(constraint.barrier, constraint.reduction, constraint.gamma, constraint.pairs)
 
 
-def judge(settings: Config, D: int) -> Constraint:
-    """The constraint that samples are judged by."""
-    return RobotAvoidance(PointRobots(D // 2), judged_radius(settings), _barrier(settings.constraint))
+def joined(constraints: Sequence[Constraint]) -> Constraint:
+    """Several constraints as one."""
+    return constraints[0] if len(constraints) == 1 else Sum(constraints)
 
 
-def robot_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:
-    """The constraint that labels, corrects and guides: robots keep their distance, and a margin."""
-    return RobotAvoidance(PointRobots(D // 2), settings.constraint.radius + margin, _barrier(settings.constraint))
+def labels(settings: Config, task: Task) -> Constraint:
+    """What demonstrations are labelled by: all that training keeps."""
+    return joined([one.shaped(barrier(settings)) for one in task.constraints().values()])
 
 
-def kept(settings: Config, D: int) -> Constraint:
-    """What training corrects for and guidance keeps: the robots' distance and, where asked for, the walls."""
-    margin, robots = settings.correction.margin, robot_avoidance(settings, D, settings.correction.margin)
-    if not settings.correction.walls:
-        return robots
-    return Sum([robots, Workspace(PointRobots(D // 2), margin, _barrier(settings.constraint))])
+def kept(settings: Config, task: Task) -> Constraint:
+    """What training corrects for and guidance keeps: the same with the margin and, where asked for, the walls."""
+    margin, shape = settings.correction.margin, barrier(settings)
+    terms = [one.shaped(shape, margin) for one in task.constraints().values()]
+    return joined([*terms, Workspace(task.robots).shaped(shape, margin)] if settings.correction.walls else terms)
 
 
-def obstacle_avoidance(settings: Config, D: int, margin: float = 0.0) -> Constraint:
-    """The constraint that appears at inference alone: robots, discs of half the touching distance, miss a disc."""
-    reach = settings.constraint.radius / 2 + margin
-    return ObstacleAvoidance(PointRobots(D // 2), [settings.sample.obstacle], reach, _barrier(settings.constraint))
-
-
-def correction(settings: config.Correction, constraint: Constraint, source: Source) -> Correction:
+def build_correction(chosen: of_flow.Correction, constraint: Constraint, source: Source) -> Correction:
     """u^c of a constraint, smoothed as the settings say."""
-    if settings.smoothing == "covariant":
+    if chosen.smoothing == "covariant":
         return Correction(constraint, covariant(source.covariance))
-    smoothing = gaussian_filter(len(source.prior), settings.sigma, settings.width, settings.edges)
-    if settings.keep_ends:
+    smoothing = gaussian_filter(len(source.prior), chosen.sigma, chosen.width, chosen.edges)
+    if chosen.keep_ends:
         smoothing[source.index] = 0
     return Correction(constraint, smoothing)
 
 
-def network(settings: config.Network, source: Source, D: int, constraint: Constraint) -> ResMLP | SpectralMLP:
+def build_network(chosen: of_flow.Network, source: Source, D: int, constraint: Constraint) -> ResMLP | SpectralMLP:
     """The velocity network v_theta."""
-    if settings.kind == "spectral":
-        return SpectralMLP(source, D, constraint, settings.hidden, settings.blocks)
-    return ResMLP(len(source.prior), D, settings.hidden, settings.blocks, settings.sees_ends)
+    if chosen.kind == "spectral":
+        return SpectralMLP(source, D, constraint, chosen.hidden, chosen.blocks)
+    return ResMLP(len(source.prior), D, chosen.hidden, chosen.blocks, chosen.sees_ends)
 
 
-def repaired(settings: Config, x: Tensor) -> Tensor:
-    """Demonstrations x (N, T, D), those in collision moved out of it by the margin, along the source's covariance."""
-    D = x.shape[2]
-    constraint = RobotAvoidance(
-        PointRobots(D // 2), settings.constraint.radius + settings.correction.margin, Barrier("relu")
-    )
+def repaired(settings: Config, task: Task, x: Tensor) -> Tensor:
+    """Demonstrations x (N, T, D), those in violation moved out of it by the margin, along the source's covariance."""
+    shape, margin = Barrier("relu"), settings.correction.margin
+    constraint = joined([one.shaped(shape, margin) for one in task.constraints().values()])
     return repair(x, Correction(constraint, covariant(build_source(settings.source, x.shape[1]).covariance)))
 
 
@@ -103,7 +187,3 @@ def random_stream(*key: str | int, device: torch.device | str = "cpu") -> torch.
     """
     digest = hashlib.sha256(repr(key).encode()).digest()
     return torch.Generator(device).manual_seed(int.from_bytes(digest[:8], "big") >> 1)
-
-
-def _barrier(settings: config.Constraint) -> Barrier:
-    return Barrier(settings.barrier, settings.reduction, settings.gamma)

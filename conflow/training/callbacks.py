@@ -6,12 +6,13 @@ from typing import Any
 import torch
 from lightning import Callback, Trainer
 from rich.progress import TaskID
+from torchmetrics import MetricCollection
 
 from conflow.training.build import random_stream
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import cycle
 from conflow.training.metrics import CollisionRate
-from conflow.training.module import ConFlow
+from conflow.training.model import ConFlow
 from conflow.training.progress import ProgressDisplay
 
 VALIDATION_SAMPLES = 256
@@ -95,7 +96,7 @@ class TrainingProgress(Callback):
 
 
 class ValidationSamples(Callback):
-    """Takes a small sample at every validation: the curve val/none/robot_collision_rate beside val/loss.
+    """Takes a small sample at every validation: the curves val/none/CONSTRAINT_collision_rate beside val/loss.
 
     Of the trained model there is more under validation/: every setting and metric, and as many samples as of test.
     """
@@ -109,9 +110,10 @@ class ValidationSamples(Callback):
         model: ConFlow = pl_module
         x_1 = cycle(self.data.val.x, min(VALIDATION_SAMPLES, model.config.sample.num)).to(model.device)
         noise = random_stream("validation samples", model.config.seed, device=model.device)
-        rate = CollisionRate("robot_collision", model.robots).to(model.device)
-        rate.update(model.sample(x_1, "none", noise))
-        metrics = {f"val/none/{name}": value for name, value in rate.compute().items()}
+        named = {name: CollisionRate(f"{name}_collision", model.judged[name]) for name in model.task.constraints()}
+        rates = MetricCollection(dict(named), compute_groups=False).to(model.device)
+        rates.update(model.sample(x_1, "none", noise))
+        metrics = {f"val/none/{name}": value for name, value in rates.compute().items()}
         # val/loss goes along: Lightning would log it at the step before.
         metrics["val/loss"] = float(trainer.callback_metrics["val/loss"])
         trainer.logger.log_metrics(metrics, trainer.global_step)

@@ -13,29 +13,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
 
-import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
 from conflow.errors import ConfigError, brief, nearest
-from conflow.flow.correction import Edges
-from conflow.flow.sampler import Guidance, Solver
-from conflow.scene.constraint import BarrierShape, Obstacle, Reduction
+from conflow.flow.settings import Correction, Guidance, Network, Solver, Source, Weight
+from conflow.scene.settings import Constraint, Data, Obstacle
+from conflow.tracking import code
 
 PACKAGE = Path(__file__).parents[1]
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
 """Inside the package where it was installed from a wheel, beside it in a checkout."""
 
-SourceKind = Literal["gaussian", "gp", "cgp"]
 Schedule = Literal["constant", "one_cycle"]
-NetworkKind = Literal["resmlp", "spectral"]
-Smoothing = Literal["filter", "covariant"]
-Place = Literal["point", "end"]
-Mask = Literal["violates", "feasible"]
-PathKind = Literal["linear", "guided"]
 Norm = Literal["waypoints", "modes"]
 Accelerator = Literal["auto", "cpu", "gpu", "mps"]
 SplitName = Literal["val", "test"]
+PAPERS_TASK = "swap"
 Tree = dict[str, Any]
 
 SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
@@ -52,6 +43,8 @@ SIZES = (
     "sample.num",
 )
 """How much is computed: whole numbers that presets set, and that an ablation does not set but may multiply."""
+OF_SWAPS = ("data.horizon", "data.amplitudes", "data.jitter", "constraint.radius", "sample.obstacle.", "sample.radius")
+"""Settings of the tasks of two robots that swap sides: a task of one's own says in its file what these do."""
 MOST_NUMBERS = 64
 """The longest list that a setting may be: OmegaConf takes its time over each number."""
 
@@ -73,70 +66,8 @@ class Range:
         return " and ".join(f"{word} {bound:.16g}" for word, bound in bounds.items() if math.isfinite(bound))
 
 
-Positive = Annotated[float, Range(above=0, high=1e9)]
-Weight = Annotated[float, Range(0, 1e9)]
-# Their squares and inverses must stay numbers, also in single precision.
-Scale = Annotated[float, Range(1e-6, 1e6)]
-Count = Annotated[int, Range(1, 10**9)]
-Seed = Annotated[int, Range(0, 2**32 - 1)]
-Fraction = Annotated[float, Range(above=0, high=1)]
-
-
-@dataclass(frozen=True)
-class Data:
-    path: str | None
-    num: Annotated[int, Range(10, 10**8)]
-    horizon: Annotated[int, Range(3, 4096)]
-    amplitudes: Annotated[list[float], Range(0, 1)]
-    jitter: Annotated[float, Range(0, 0.2)]
-    seed: Seed
-    negatives: bool
-    negative_share: Annotated[float | None, Range(0, 1)]
-    repair: bool
-    val_fraction: Fraction
-    test_fraction: Fraction
-
-
-@dataclass(frozen=True)
-class Source:
-    kind: SourceKind
-    length_scale: Scale
-    sigma_f: Scale
-    epsilon: Annotated[float, Range(1e-12, 1e6)]
-    modes: Annotated[int | None, Range(1, 4096)]
-    fit: bool
-
-
-@dataclass(frozen=True)
-class Constraint:
-    radius: Annotated[float, Range(above=0, high=2)]
-    barrier: BarrierShape
-    gamma: Scale
-    reduction: Reduction
-
-
-@dataclass(frozen=True)
-class Correction:
-    lambda_c: Weight
-    mask: Mask
-    at: Place
-    ramp: Annotated[float, Range(0, 100)]
-    path: PathKind
-    margin: Annotated[float, Range(0, 1)]
-    walls: bool
-    smoothing: Smoothing
-    sigma: Scale
-    width: Annotated[int, Range(1, 8191)]
-    edges: Edges
-    keep_ends: bool
-
-
-@dataclass(frozen=True)
-class Network:
-    kind: NetworkKind
-    hidden: Annotated[int, Range(1, 65536)]
-    blocks: Annotated[int, Range(0, 1024)]
-    sees_ends: bool
+Positive = Annotated[float, {"above": 0, "high": 1e9}]
+Count = Annotated[int, {"low": 1, "high": 10**9}]
 
 
 @dataclass(frozen=True)
@@ -154,31 +85,24 @@ class Train:
 
 @dataclass(frozen=True)
 class Sample:
-    num: Annotated[int, Range(2, 10**9)]
+    num: Annotated[int, {"low": 2, "high": 10**9}]
     solver: Solver
     steps: Count
     guidance: Guidance
     robot_weight: Weight
     obstacle_weight: Weight
     obstacle: Obstacle
-    radius: Annotated[float | None, Range(above=0, high=2)]
-
-
-# Of settings whose dataclass stands in scene/.
-RANGES = {
-    "sample.obstacle.x": Range(-2, 2),
-    "sample.obstacle.y": Range(-2, 2),
-    "sample.obstacle.radius": Range(above=0, high=2),
-}
+    radius: Annotated[float | None, {"above": 0, "high": 2}]
 
 
 @dataclass(frozen=True)
 class Config:
     """One experiment. The comments of `conf/base.yaml` say what each setting is."""
 
+    task: str
     ablation: str
     preset: str
-    seed: Seed
+    seed: Annotated[int, {"low": 0, "high": 2**32 - 1}]
     data: Data
     source: Source
     constraint: Constraint
@@ -193,44 +117,71 @@ class Config:
 
     def identity(self) -> Tree:
         """The settings that say which experiment this is: all but the accelerator, on which it may go on elsewhere."""
-        tree = self.tree()
+        tree = self.tree() | {"task": self.task_name}
         del tree["train"]["accelerator"]
+        if is_file(self.task):
+            tree["task_code"] = code.of_file(Path(self.task))
         return tree
+
+    @property
+    def task_name(self) -> str:
+        """The task's, whatever folder its file is in."""
+        return Path(self.task).stem if is_file(self.task) else self.task
+
+    @property
+    def name(self) -> str:
+        """ABLATION-sSEED, behind the task where that is not the paper's."""
+        own = f"{self.ablation}-s{self.seed}"
+        return own if self.task == PAPERS_TASK else f"{self.task_name}-{own}"
 
     def sha(self) -> str:
         """A fingerprint of `identity`, 16 hexadecimal digits."""
+        import yaml
+
         return hashlib.sha256(yaml.safe_dump(self.identity()).encode()).hexdigest()[:16]
 
 
+def is_file(task: str) -> bool:
+    """Whether a task is a Python file of one's own, and none of the names under conf/task/."""
+    return task.endswith(".py")
+
+
 def names(axis: str) -> list[str]:
-    """The ablations or presets that exist: the files under conf/<axis>/."""
+    """The tasks, ablations or presets that exist: the files under conf/<axis>/."""
     return sorted(file.stem for file in (CONF / axis).glob("*.yaml"))
 
 
 def load(arguments: Sequence[str] = ()) -> Config:
-    """conf/base.yaml, then the preset, then the ablation, then arguments `key=value`, checked.
+    """conf/base.yaml, then task, preset and ablation, then arguments `key=value`, checked.
 
     An ablation's block `times` multiplies what base and preset say, so that its lengths follow every preset.
 
     Raises:
         ConfigError: an unknown name, a value of the wrong type or out of range.
     """
+    from omegaconf import OmegaConf
+
     pairs = [split(argument) for argument in arguments]
     base = _read("base")
-    chosen = {axis: str(dict(pairs).get(axis, base[axis])) for axis in ("preset", "ablation")}
+    chosen = {axis: str(dict(pairs).get(axis, base[axis])) for axis in ("task", "preset", "ablation")}
     for axis, name in chosen.items():
-        if name not in names(axis):
-            offer = nearest(name, names(axis))
-            raise ConfigError(f"{axis}={brief(name)}: expected one of {', '.join(names(axis))}{offer}")
-    preset, ablation = (_read(f"{axis}/{name}") for axis, name in chosen.items())
+        if name not in names(axis) and not (axis == "task" and is_file(name)):
+            known = ", ".join([*names(axis), *(["a file FILE.py"] if axis == "task" else [])])
+            raise ConfigError(f"{axis}={brief(name)}: expected one of {known}{nearest(name, names(axis))}")
+    task = {} if is_file(chosen["task"]) else _read(f"task/{chosen['task']}")
+    preset, ablation = (_read(f"{axis}/{chosen[axis]}") for axis in ("preset", "ablation"))
     factors = _factors(f"conf/ablation/{chosen['ablation']}.yaml", ablation.pop("times", {}))
     settings = _schema(Config)
-    for key, value in (flatten(base) | flatten(preset)).items():
+    for key, value in (flatten(base) | flatten(task) | flatten(preset)).items():
         _set(settings, key, value)
     for key, factor in factors.items():
         _set(settings, key, _multiplied(key, OmegaConf.select(settings, key), factor))
     for key, value in [*flatten(ablation).items(), *pairs]:
         _set(settings, key, value)
+    for key, value in pairs if is_file(chosen["task"]) else ():
+        if key.startswith(OF_SWAPS):
+            swaps = ", ".join(names("task"))
+            raise ConfigError(f"{key}={brief(value)}: expected one of the tasks {swaps}, which it belongs to")
     return from_tree(OmegaConf.to_container(settings))
 
 
@@ -265,16 +216,43 @@ def from_tree(tree: Any) -> Config:
     Raises:
         ConfigError: as `load`; also where a setting is missing.
     """
-    settings = _schema(Config)
-    for key, value in flatten(tree).items():
-        _set(settings, key, value)
-    missing = sorted(OmegaConf.missing_keys(settings))
-    if missing:
-        raise ConfigError(f"{missing[0]}: expected a value, found none")
-    config = OmegaConf.to_object(settings)
+    config = _built(Config, tree)
     assert isinstance(config, Config)
     _check(config)
     return config
+
+
+def _built(cls: type, tree: Any, prefix: str = "") -> Any:
+    """The dataclass of a tree of plain values, without OmegaConf, which takes its time."""
+    hints = get_type_hints(cls)
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{prefix.removesuffix('.') or 'settings'}={brief(tree)}: expected nested settings")
+    for key in tree:
+        if key not in hints:
+            known = f"expected one of conf/base.yaml{nearest(prefix + key, list(_types()))}"
+            raise ConfigError(f"{brief(prefix + key)}: no such setting, {known}")
+    values = {}
+    for key, kind in hints.items():
+        if key not in tree:
+            raise ConfigError(f"{prefix}{key}: expected a value, found none")
+        value = tree[key]
+        if dataclasses.is_dataclass(kind):
+            values[key] = _built(cast(type, kind), value, f"{prefix}{key}.")
+            continue
+        values[key] = float(value) if kind in (float, float | None) and type(value) is int else value
+        if not _fits(values[key], kind):
+            raise ConfigError(f"{prefix}{key}={brief(value)}: expected {_describe(kind)}")
+    return cls(**values)
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a plain value is of a setting's type."""
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if kind == list[float]:
+        return isinstance(value, list) and all(isinstance(one, int | float) for one in value)
+    of_kind = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    return of_kind and not _refers(value)
 
 
 def override(config: Config, arguments: Sequence[str], allowed: Sequence[str]) -> Config:
@@ -283,6 +261,8 @@ def override(config: Config, arguments: Sequence[str], allowed: Sequence[str]) -
     Raises:
         ConfigError: as `load`; also for a key that is not allowed.
     """
+    from omegaconf import OmegaConf
+
     settings = _schema(Config)
     for key, value in flatten(config.tree()).items():
         _set(settings, key, value)
@@ -305,11 +285,11 @@ def flatten(tree: Tree, prefix: str = "") -> Tree:
 def _fields(cls: type = Config, prefix: str = "") -> Iterator[tuple[str, Any, Range]]:
     """Every setting's dotted key, type and range."""
     for name, annotation in get_type_hints(cls, include_extras=True).items():
-        kind, allowed = get_args(annotation) if get_origin(annotation) is Annotated else (annotation, Range())
+        kind, bounds = get_args(annotation) if get_origin(annotation) is Annotated else (annotation, {})
         if dataclasses.is_dataclass(kind):
             yield from _fields(cast(type, kind), f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}", kind, RANGES.get(f"{prefix}{name}", allowed)
+            yield f"{prefix}{name}", kind, Range(**bounds)
 
 
 @functools.cache
@@ -320,6 +300,8 @@ def _types() -> dict[str, Any]:
 
 def _schema(cls: type) -> Any:
     """The typed tree with every setting missing; open for writing although the dataclasses are frozen."""
+    from omegaconf import OmegaConf
+
     node = OmegaConf.structured(cls)
     OmegaConf.set_readonly(node, False)
     for name, kind in get_type_hints(cls).items():
@@ -329,6 +311,8 @@ def _schema(cls: type) -> Any:
 
 
 def _read(name: str) -> Tree:
+    import yaml
+
     try:
         tree = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     except (OSError, yaml.YAMLError) as error:
@@ -348,6 +332,10 @@ def split(argument: str) -> tuple[str, str]:
 
 def _set(settings: Any, key: str, value: Any) -> None:
     """Set one key to a value, or to the value that an argument's text means for a setting of its type."""
+    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
     types = _types()
     if key not in types:
         raise ConfigError(f"{brief(key)}: no such setting, expected one of conf/base.yaml{nearest(key, list(types))}")
@@ -366,6 +354,8 @@ def _parse(text: str, kind: Any) -> Any:
         return text
     if kind == str | None:
         return None if text in ("", "null") else text
+    import yaml
+
     if kind == list[float]:
         numbers = yaml.safe_load(text)
         if isinstance(numbers, list) and len(numbers) > MOST_NUMBERS:

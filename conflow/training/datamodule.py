@@ -8,9 +8,11 @@ from lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
-from conflow.scene import trajectories
-from conflow.scene.trajectories import DemonstrationError
-from conflow.training.build import random_stream, repaired, robot_avoidance
+from conflow.scene import demonstrations
+from conflow.scene.demonstrations import Demonstrations
+from conflow.scene.errors import DemonstrationError
+from conflow.scene.task import Task
+from conflow.training.build import build_task, labels, random_stream, repaired
 from conflow.training.config import Config, SplitName
 from conflow.training.memory import check_memory
 
@@ -81,6 +83,7 @@ class DemonstrationData(LightningDataModule):
         held_out: what models are measured on, D+ and D- as they were demonstrated: `test`, and all of the validation
             split, of which `val` is what val/loss is taken on.
         origin: where the demonstrations are from, as messages say it.
+        task: what they are for.
         x, violates: all demonstrations and their labels M.
         digest: fingerprint of x, and of the labels that came with it; others follow from x and the config.
 
@@ -89,29 +92,45 @@ class DemonstrationData(LightningDataModule):
         ConfigError: so many demonstrations or samples do not fit into this machine's memory.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, task: Task | None = None) -> None:
         super().__init__()
         self.config = config
-        self.origin, (x, violates) = self._demonstrations()
-        trajectories.check(x, self.origin)
+        self.origin, found, self.task = self._demonstrations(task)
+        x, violates = found.x, found.violates
         self.x = x
         self.T, self.D = x.shape[1:]
-        # x_1, and of either split x_0 and what each of the three settings makes of it; the metrics join one, and double
-        # its precision.
-        check_memory("sample.num", config.sample.num, 12 * 4 * config.sample.num * self.T * self.D)
-        self.violates = robot_avoidance(config, self.D).violation(x) if violates is None else violates
-        self.digest = trajectories.digest(x, violates)
+        # x_1, and of either split x_0 and what each of the settings makes of it; the metrics join one, and double its
+        # precision.
+        pieces = 2 * (len(self.task.settings()) + 1) + 6
+        check_memory("sample.num", config.sample.num, pieces * 4 * config.sample.num * self.T * self.D)
+        self.violates = labels(config, self.task).violation(x) if violates is None else violates
+        self.digest = demonstrations.digest(x, violates)
         self.held_out: dict[SplitName, Split] = {}
         self.train, self.val, self.test = self._split(self.origin)
 
-    def _demonstrations(self) -> tuple[str, trajectories.Demonstrations]:
+    def _demonstrations(self, task: Task | None) -> tuple[str, Demonstrations, Task]:
+        """Where they are from, what they are, and the task they are for."""
         data = self.config.data
         if data.path is not None:
-            return f"data.path={data.path}", trajectories.load(data.path)
-        # The whole once more in the splits, and twice while it is generated.
-        check_memory("data.num", data.num, 4 * 4 * data.num * data.horizon * 4)
-        x = trajectories.swap(data.num, data.horizon, data.amplitudes, data.jitter, data.seed)
-        return "generated demonstrations", trajectories.Demonstrations(x, None)
+            origin, found = f"data.path={data.path}", demonstrations.load(data.path)
+            demonstrations.check(found.x, origin)
+            task = task or build_task(self.config, *found.x.shape[1:])
+            task.scale, task.seconds = found.scale, found.seconds
+            task.offset = [*found.offset] * (task.robots.D // len(found.offset))
+        else:
+            task = task or build_task(self.config)
+            # The whole once more in the splits, and twice while it is generated.
+            check_memory("data.num", data.num, 4 * 4 * data.num * task.T * task.robots.D)
+            made = task.demonstrations(data.num, data.seed)
+            origin = f"demonstrations of task {task.name}"
+            found = made if isinstance(made, Demonstrations) else Demonstrations(made)
+            demonstrations.check(found.x, origin)
+        if found.x.shape[1:] != (task.T, task.robots.D):
+            raise DemonstrationError(
+                f"{origin}: x has shape {tuple(found.x.shape)}, expected (N, {task.T}, {task.robots.D}), the waypoints "
+                f"and the numbers of task {task.name}"
+            )
+        return origin, found, task
 
     def _split(self, name: str) -> tuple[Split, Split, Split]:
         data = self.config.data
@@ -146,8 +165,8 @@ class DemonstrationData(LightningDataModule):
         return train_split, val_split, test_split
 
     def _repaired(self, split: Split) -> Split:
-        x = repaired(self.config, split.x)
-        return Split(x, robot_avoidance(self.config, self.D).violation(x))
+        x = repaired(self.config, self.task, split.x)
+        return Split(x, labels(self.config, self.task).violation(x))
 
     def train_dataloader(self) -> Batches:
         train = self.config.train

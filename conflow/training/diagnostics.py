@@ -1,16 +1,18 @@
 """What guidance does along the sampling ODE, what the network takes back, and how weight and solver change results."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from conflow.flow.path import interpolate
-from conflow.flow.sampler import Solver, integrate, states
+from conflow.flow.sampler import integrate, states
+from conflow.flow.settings import Solver
 from conflow.scene.constraint import Constraint
-from conflow.training.metrics import endpoint_error, smoothness
-from conflow.training.module import ConFlow, Setting, start_and_goal
+from conflow.scene.measures import endpoint_error, smoothness
+from conflow.training.build import joined
+from conflow.training.model import NONE, ConFlow, start_and_goal
 
 EVALUATIONS: dict[Solver, int] = {"euler": 1, "midpoint": 2, "rk4": 4}
 """Network evaluations of one step."""
@@ -19,15 +21,14 @@ PUSH = 0.25
 
 
 @dataclass(frozen=True)
-class Guidance:
+class GuidanceTrace:
     """One setting along the sampling ODE, at t = 0, 1/steps, ..., 1: tensors (steps + 1,).
 
     Attributes:
         t: flow time.
         ratio: |g| / |v(x_t, t)| with g what guidance adds to v, lambda u^c(x_t) or that at the predicted end; both the
             norm over the whole batch, i.e. the ratio of root mean squares.
-        robot_barrier: mean over the batch of the robots' barrier C(x_t), in workspace units.
-        obstacle_barrier: that of the obstacle's barrier.
+        barriers: by the constraint's name, the mean over the batch of its C(x_t), in workspace units.
         start_drift: distance between the guided and the unguided x_1 of the same x_0 at the start, mean over robots and
             batch, in workspace units.
         end_drift: the same at the goal.
@@ -35,8 +36,7 @@ class Guidance:
 
     t: Tensor
     ratio: Tensor
-    robot_barrier: Tensor
-    obstacle_barrier: Tensor
+    barriers: Mapping[str, Tensor]
     start_drift: float
     end_drift: float
 
@@ -47,7 +47,7 @@ class Solved:
 
     Attributes:
         evaluations: network evaluations for one trajectory.
-        collisions: how many trajectories violate the robots' constraint.
+        collisions: how many trajectories violate what training keeps.
         smoothness: of each trajectory, (batch,).
     """
 
@@ -57,24 +57,23 @@ class Solved:
 
 
 @torch.no_grad()
-def guidance(model: ConFlow, setting: Setting, x_0: Tensor, ends: Tensor | None = None) -> Guidance:
+def guidance(model: ConFlow, setting: str, x_0: Tensor, ends: Tensor | None = None) -> GuidanceTrace:
     """Follow a setting's ODE from samples x_0 (batch, T, D) of the source; `ends` as in `ConFlow.field`."""
     steps, solver = model.config.sample.steps, model.config.sample.solver
-    field, v = model.field(setting, ends), model.field("none", ends)
+    field, v = model.field(setting, ends), model.field(NONE, ends)
     t = torch.arange(steps + 1) / steps
-    ratio, robot_barrier, obstacle_barrier = [], [], []
+    ratio = []
+    barriers: dict[str, list[Tensor]] = {name: [] for name in model.judged}
     x = x_0
     for time, x in zip(t, states(field, x_0, steps, solver), strict=True):
         at = time.expand(len(x))
         flow = v(x, at)
         ratio.append((field(x, at) - flow).norm() / flow.norm())
-        robot_barrier.append(model.robots.barrier(x).mean())
-        obstacle_barrier.append(model.obstacle.barrier(x).mean())
+        for name, constraint in model.judged.items():
+            barriers[name].append(constraint.barrier(x).mean())
     plain = integrate(v, x_0, steps, solver)
-    start_drift, end_drift = (float(endpoint_error(x, plain, waypoint).mean()) for waypoint in (0, -1))
-    return Guidance(
-        t, torch.stack(ratio), torch.stack(robot_barrier), torch.stack(obstacle_barrier), start_drift, end_drift
-    )
+    drift = (float(endpoint_error(model.task.robots, x, plain, waypoint).mean()) for waypoint in (0, -1))
+    return GuidanceTrace(t, torch.stack(ratio), {name: torch.stack(one) for name, one in barriers.items()}, *drift)
 
 
 @torch.no_grad()
@@ -96,18 +95,22 @@ def taken_back(model: ConFlow, x_0: Tensor, x_1: Tensor, t: float) -> Tensor:
     return torch.stack(shares)
 
 
-def avoided(model: ConFlow, setting: Setting) -> Constraint:
-    """What a setting is about: the obstacle, or else the robots."""
-    return model.obstacle if setting == "obstacle" else model.robots
+def avoided(model: ConFlow, setting: str) -> Constraint:
+    """What a setting is about: the constraints that it guides around, or all that training keeps."""
+    guided = model.guided_around(setting)
+    return joined([model.judged[name] for name in guided]) if guided else model.trained
 
 
 def collisions_by_weight(
-    model: ConFlow, setting: Setting, x_0: Tensor, weights: Sequence[float], ends: Tensor | None = None
+    model: ConFlow, setting: str, x_0: Tensor, weights: Sequence[float], ends: Tensor | None = None
 ) -> list[int]:
-    """How many of the trajectories from x_0 (batch, T, D) hit what the setting avoids, at each guidance weight."""
+    """How many of the trajectories from x_0 (batch, T, D) violate what the setting avoids, at each guidance weight."""
     sample = model.config.sample
-    u_c = model.u_c_obstacle if setting == "obstacle" else model.u_c
-    fields = [model.guided(model.field("none", ends), (u_c, weight)) for weight in weights]
+    of_inference = [
+        model.u_c_at_inference[name] for name in model.guided_around(setting) if name in model.u_c_at_inference
+    ]
+    pushes = of_inference or [model.u_c]
+    fields = [model.guided(model.field(NONE, ends), *((u_c, weight) for u_c in pushes)) for weight in weights]
     return [
         int(avoided(model, setting).violation(integrate(field, x_0, sample.steps, sample.solver)).sum())
         for field in fields
@@ -124,6 +127,8 @@ def by_evaluations(
     solved = []
     for number in evaluations:
         steps = max(1, number // EVALUATIONS[solver])
-        x = integrate(model.field("none", ends), x_0, steps, solver)
-        solved.append(Solved(steps * EVALUATIONS[solver], int(model.robots.violation(x).sum()), smoothness(x)))
+        x = integrate(model.field(NONE, ends), x_0, steps, solver)
+        solved.append(
+            Solved(steps * EVALUATIONS[solver], int(model.trained.violation(x).sum()), smoothness(model.task.robots, x))
+        )
     return solved

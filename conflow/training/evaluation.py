@@ -1,4 +1,4 @@
-"""Sampling a model under the three inference settings, and measuring what it made."""
+"""Sampling a model under every inference setting, and measuring what it made."""
 
 import time
 from dataclasses import dataclass, field
@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from conflow.flow.sampler import PIECE
+from conflow.scene.measures import endpoint_error
 from conflow.training.build import random_stream
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.datamodule import Split
-from conflow.training.metrics import EnergyDistance, endpoint_error, trajectory_metrics
-from conflow.training.module import SETTINGS, ConFlow, Setting, start_and_goal
+from conflow.training.metrics import EnergyDistance, trajectory_metrics
+from conflow.training.model import NONE, ConFlow, start_and_goal
 from conflow.training.progress import ProgressDisplay
 
 LATENCY_BATCH = 256
@@ -37,8 +38,8 @@ class Evaluation:
     """
 
     source_samples: Tensor
-    samples: dict[Setting, Tensor] = field(default_factory=dict)
-    results: dict[Setting, Metrics] = field(default_factory=dict)
+    samples: dict[str, Tensor] = field(default_factory=dict)
+    results: dict[str, Metrics] = field(default_factory=dict)
     baseline: dict[str, Metrics] = field(default_factory=dict)
 
     def keyed(self, prefix: str = "test/", baseline: bool = True) -> Metrics:
@@ -66,7 +67,7 @@ def evaluate(
         name: the split's. Each has noise of its own, and what no model touched is measured on the test split alone.
         timed: an evaluation of the same model, whose latencies hold here too; without it they are measured.
     """
-    task = display.add(f"sampling {SPLITS[name]}", len(SETTINGS))
+    task = display.add(f"sampling {SPLITS[name]}", len(model.settings))
     demonstrations, violates = split.x.to(model.device), split.violates.to(model.device)
     feasible = demonstrations[~violates]
     reference = feasible if len(feasible) > 1 else None  # one has no distance to another
@@ -82,11 +83,13 @@ def evaluate(
             if int(violates.sum()) > 1:
                 evaluation.baseline["data"] |= _mixture_distance(demonstrations[violates], feasible)
         evaluation.baseline["source"] = measure(model, x_0, x_1, reference)
-    for done, setting in enumerate(SETTINGS, start=1):
+    for done, setting in enumerate(model.settings, start=1):
         x = model.flow(x_0, setting, start_and_goal(x_1))
         evaluation.samples[setting] = x.cpu()
         drift = {
-            f"{name}_drift": float(endpoint_error(x.cpu(), evaluation.samples["none"], waypoint).mean())
+            f"{name}_drift": float(
+                endpoint_error(model.task.robots, x.cpu(), evaluation.samples[NONE], waypoint).mean()
+            )
             for name, waypoint in {"start": 0, "end": -1}.items()
         }
         latency = timed.results[setting]["latency_ms"] if timed else _latency_ms(model, x_1, setting)
@@ -95,12 +98,12 @@ def evaluate(
     return evaluation
 
 
-def measure(model: ConFlow, x: Tensor, x_1: Tensor, reference: Tensor | None, setting: Setting = "none") -> Metrics:
+def measure(model: ConFlow, x: Tensor, x_1: Tensor, reference: Tensor | None, setting: str = NONE) -> Metrics:
     """The metrics of trajectories x whose starts and goals were those of x_1, both (num, T, D).
 
     With the energy distance to a reference (m, T, D) where there is one; success is to keep what the setting asks for.
     """
-    metrics = trajectory_metrics(model.robots, model.obstacle, reference, model.required(setting)).to(model.device)
+    metrics = trajectory_metrics(model.judged, model.trained, reference, model.required(setting)).to(model.device)
     for piece, demonstrated in zip(x.split(PIECE), x_1.split(PIECE), strict=True):
         metrics.update(x=piece, x_1=demonstrated)
     return metrics.compute() | {"num": len(x)}
@@ -123,7 +126,7 @@ def _mixture_distance(negatives: Tensor, feasible: Tensor) -> Metrics:
     return {name: p**2 * value for name, value in metric.compute().items()}
 
 
-def _latency_ms(model: ConFlow, x_1: Tensor, setting: Setting, repetitions: int = 3) -> float:
+def _latency_ms(model: ConFlow, x_1: Tensor, setting: str, repetitions: int = 3) -> float:
     """Median time of sampling one batch of 256, in milliseconds."""
     x_1 = cycle(x_1, LATENCY_BATCH)
     times = []

@@ -3,8 +3,6 @@
 import os
 from pathlib import Path
 
-import torch
-
 from conflow.errors import ConfigError, brief
 from conflow.training.config import Config
 
@@ -44,6 +42,8 @@ def check_training(config: Config) -> None:
     Raises:
         ConfigError: names the setting, what it asks for and what the machine has.
     """
+    import torch  # only now: a mistyped setting is answered before
+
     cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
     has = {"auto": True, "cpu": True, "gpu": cuda or mps, "mps": mps}
     if not has[config.train.accelerator]:

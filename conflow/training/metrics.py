@@ -13,6 +13,16 @@ from torchmetrics import Metric, MetricCollection
 from torchmetrics.utilities import dim_zero_cat
 
 from conflow.scene.constraint import Constraint
+from conflow.scene.measures import (
+    endpoint_error,
+    keeps,
+    leaves_workspace,
+    path_length,
+    peak_acceleration,
+    smoothness,
+    squared_acceleration,
+)
+from conflow.scene.robots import Robots
 
 Z = 1.959963984540054
 """The 97.5 % quantile of the standard normal: all intervals are 95 % intervals."""
@@ -44,55 +54,6 @@ def quantile_interval(values: Tensor, q: float) -> tuple[float, float]:
     ranks = torch.tensor([math.floor(n * q - spread), math.ceil(n * q + spread)]).clamp(0, n - 1)
     low, high = values.sort().values[ranks].tolist()
     return low, high
-
-
-def smoothness(x: Tensor) -> Tensor:
-    """Mean over waypoints and robots of the norm of the second difference of positions, (batch,).
-
-    1 / (T - 2) sum_i |q_{i+1} - 2 q_i + q_{i-1}| for x (batch, T, D) with two coordinates per robot, in
-    workspace units per waypoint squared: smaller is smoother.
-    """
-    return _acceleration(x).mean(dim=(1, 2))
-
-
-def _acceleration(x: Tensor) -> Tensor:
-    """The norm of the second difference of each robot's positions, (batch, T - 2, robots)."""
-    return torch.linalg.vector_norm(_positions(x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]), dim=3)
-
-
-def peak_acceleration(x: Tensor) -> Tensor:
-    """Another reading of smoothness: as `smoothness`, the largest over waypoints in place of the mean, (batch,)."""
-    return _acceleration(x).mean(dim=2).amax(dim=1)
-
-
-def squared_acceleration(x: Tensor) -> Tensor:
-    """Another reading of smoothness: the mean over waypoints and robots of the squared second difference, (batch,)."""
-    return _acceleration(x).square().mean(dim=(1, 2))
-
-
-def path_length(x: Tensor) -> Tensor:
-    """Mean over robots of the length of the path, sum_i |q_{i+1} - q_i| in workspace units, (batch,)."""
-    return torch.linalg.vector_norm(_positions(x.diff(dim=1)), dim=3).sum(dim=1).mean(dim=1)
-
-
-def leaves_workspace(x: Tensor) -> Tensor:
-    """Whether some waypoint is outside [-1, 1]^2, or is not a number, boolean (batch,)."""
-    return ~(x.abs().flatten(1).amax(dim=1) <= 1)
-
-
-def keeps(constraint: Constraint, x: Tensor) -> Tensor:
-    """Whether x keeps a constraint on the straight lines between its waypoints too, boolean (batch,)."""
-    return constraint.swept_clearance(x).amin(dim=1) >= 0
-
-
-def endpoint_error(x: Tensor, x_1: Tensor, waypoint: int) -> Tensor:
-    """Mean over robots of the distance between x and x_1 (batch, T, D) at a waypoint, (batch,)."""
-    return torch.linalg.vector_norm(_positions(x - x_1)[:, waypoint], dim=2).mean(dim=1)
-
-
-def _positions(x: Tensor) -> Tensor:
-    """Each robot's coordinates, (batch, T, robots, 2)."""
-    return x.reshape(*x.shape[:2], -1, 2)
 
 
 def _distance_sums(x: Tensor, y: Tensor) -> Tensor:
@@ -202,7 +163,8 @@ class SuccessRate(_Rate):
         self.constraint = constraint
 
     def update(self, x: Tensor, x_1: Tensor) -> None:
-        reached = (endpoint_error(x, x_1, 0) <= REACHED) & (endpoint_error(x, x_1, -1) <= REACHED)
+        robots = self.constraint.robots
+        reached = (endpoint_error(robots, x, x_1, 0) <= REACHED) & (endpoint_error(robots, x, x_1, -1) <= REACHED)
         self.add(reached & ~leaves_workspace(x) & keeps(self.constraint, x))
 
 
@@ -229,12 +191,14 @@ class _Values(Metric):
 class Smoothness(_Values):
     """Median and 95th percentile of `smoothness`, or of another reading of it, with intervals of order statistics."""
 
-    def __init__(self, name: str = "smoothness", reading: Callable[[Tensor], Tensor] = smoothness) -> None:
+    def __init__(
+        self, robots: Robots, name: str = "smoothness", reading: Callable[[Robots, Tensor], Tensor] = smoothness
+    ) -> None:
         super().__init__()
-        self.name, self.reading = name, reading
+        self.robots, self.name, self.reading = robots, name, reading
 
     def update(self, x: Tensor) -> None:
-        self.values.append(self.reading(x))
+        self.values.append(self.reading(self.robots, x))
 
     def compute(self) -> dict[str, float]:
         return self.quantiles({f"{self.name}_median": 0.5, f"{self.name}_p95": 0.95})
@@ -243,8 +207,12 @@ class Smoothness(_Values):
 class PathLength(_Values):
     """Median of `path_length`, with the interval of order statistics: what stands still or wanders shows here."""
 
+    def __init__(self, robots: Robots) -> None:
+        super().__init__()
+        self.robots = robots
+
     def update(self, x: Tensor) -> None:
-        self.values.append(path_length(x))
+        self.values.append(path_length(self.robots, x))
 
     def compute(self) -> dict[str, float]:
         return self.quantiles({"path_length_median": 0.5})
@@ -254,16 +222,17 @@ class EndpointError(_Values):
     """Mean over trajectories of `endpoint_error`, with the normal interval of a mean.
 
     Args:
+        robots: what moves.
         name: the metric's name.
         waypoint: 0 for the start, -1 for the goal.
     """
 
-    def __init__(self, name: str, waypoint: int) -> None:
+    def __init__(self, robots: Robots, name: str, waypoint: int) -> None:
         super().__init__()
-        self.name, self.waypoint = name, waypoint
+        self.robots, self.name, self.waypoint = robots, name, waypoint
 
     def update(self, x: Tensor, x_1: Tensor) -> None:
-        self.values.append(endpoint_error(x, x_1, self.waypoint))
+        self.values.append(endpoint_error(self.robots, x, x_1, self.waypoint))
 
     def compute(self) -> dict[str, float]:
         values = dim_zero_cat(self.values).cpu().double()
@@ -331,30 +300,30 @@ class EnergyDistance(_Values):
 
 
 def trajectory_metrics(
-    robots: Constraint, obstacle: Constraint, reference: Tensor | None, kept: Constraint
+    judged: Mapping[str, Constraint], trained: Constraint, reference: Tensor | None, required: Constraint
 ) -> MetricCollection:
     """All metrics of generated trajectories x against the demonstrations x_1 whose starts and goals they were given.
 
     Args:
-        robots: the constraint that samples without a collision satisfy.
-        obstacle: the constraint that appears at inference alone.
+        judged: the task's constraints by name, each of which has a collision rate.
+        trained: all that training keeps.
         reference: feasible demonstrations that were held out, (m, T, D), for the energy distance; None leaves it out.
-        kept: the constraint that a trajectory must keep to succeed.
+        required: the constraint that a trajectory must keep to succeed.
     """
+    robots = trained.robots
     metrics: dict[str, Metric | MetricCollection] = {
-        "robot_collision": CollisionRate("robot_collision", robots),
-        "object_collision": CollisionRate("object_collision", obstacle),
-        "robot_collision_swept": SweptCollisionRate("robot_collision_swept", robots),
-        "near": NearRate("near", robots),
-        "success": SuccessRate("success", kept),
+        **{f"{name}_collision": CollisionRate(f"{name}_collision", one) for name, one in judged.items()},
+        **{f"{name}_swept": SweptCollisionRate(f"{name}_collision_swept", one) for name, one in judged.items()},
+        "near": NearRate("near", trained),
+        "success": SuccessRate("success", required),
         "outside": OutsideRate("outside"),
-        "smoothness": Smoothness(),
+        "smoothness": Smoothness(robots),
         # What the paper calls smoothness it does not say; these are other readings, under their own names.
-        "peak_acceleration": Smoothness("peak_acceleration", peak_acceleration),
-        "squared_acceleration": Smoothness("squared_acceleration", squared_acceleration),
-        "path_length": PathLength(),
-        "start_error": EndpointError("start_error", 0),
-        "end_error": EndpointError("end_error", -1),
+        "peak_acceleration": Smoothness(robots, "peak_acceleration", peak_acceleration),
+        "squared_acceleration": Smoothness(robots, "squared_acceleration", squared_acceleration),
+        "path_length": PathLength(robots),
+        "start_error": EndpointError(robots, "start_error", 0),
+        "end_error": EndpointError(robots, "end_error", -1),
         "diversity": Diversity(),
     }
     if reference is not None:

@@ -1,6 +1,8 @@
 """How far a long piece of work is and how long it still takes: a bar on a terminal, else a line now and then."""
 
+import os
 import time
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -8,6 +10,18 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from conflow.tracking import signals
 
 PLAIN_SECONDS = 10.0
+FILE = "CONFLOW_PROGRESS"
+"""The environment's variable that names a file in which a process says how far it is, for who started it."""
+FILE_SECONDS = 0.5
+
+
+def read(path: Path) -> tuple[str, float, float] | None:
+    """The task, how much of it is done and how much there is, of the process that writes this file; None at first."""
+    try:
+        name, completed, total = path.read_text().split("\t")
+    except (OSError, ValueError):  # not there yet, or being written
+        return None
+    return name, float(completed), float(total)
 
 
 class ProgressDisplay:
@@ -26,7 +40,8 @@ class ProgressDisplay:
             console=console,
             disable=not console.is_terminal,
         )
-        self.printed = 0.0
+        self.printed = self.written = 0.0
+        self.file = os.environ.get(FILE)
 
     def __enter__(self) -> "ProgressDisplay":
         self.bars.start()
@@ -52,6 +67,9 @@ class ProgressDisplay:
             return
         self.bars.update(task, completed=completed, note=note)
         now = time.monotonic()
+        if self.file and (now - self.written > FILE_SECONDS or state.finished):
+            self.written = now
+            Path(self.file).write_text(f"{state.description}\t{completed:g}\t{state.total:g}")
         if self.console.is_terminal or (now - self.printed < PLAIN_SECONDS and not state.finished):
             return
         self.printed = now

@@ -3,11 +3,8 @@
 from rich.table import Table
 
 from conflow.training.evaluation import Metrics
-from conflow.training.module import Setting
 
 ROWS = {
-    "robot_collision_rate": "robot-collision rate",
-    "object_collision_rate": "object-collision rate",
     "success_rate": "success rate",
     "outside_rate": "rate of leaving the workspace",
     "energy_distance": "energy distance to held-out D+",
@@ -20,17 +17,23 @@ ROWS = {
 }
 
 
-def results_table(results: dict[Setting, Metrics], title: str) -> Table:
+def results_table(results: dict[str, Metrics], title: str) -> Table:
     """The metrics of one run on a split, a column for each setting, each with its 95 % interval."""
     num = int(next(iter(results.values()))["num"])
     made = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
     made.add_column("metric")
     for setting in results:
         made.add_column(setting, justify="right")
-    for key, label in ROWS.items():
+    for key, label in (_collisions(next(iter(results.values()))) | ROWS).items():
         made.add_row(label, *(_result(metrics, key) for metrics in results.values()))
     made.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
     return made
+
+
+def _collisions(metrics: Metrics) -> dict[str, str]:
+    """The rows of the constraints, by their metrics."""
+    names = [key.removesuffix("_collision_rate") for key in metrics if key.endswith("_collision_rate")]
+    return {f"{name}_collision_rate": f"{name}-collision rate" for name in names}
 
 
 def _result(metrics: Metrics, key: str) -> str:

@@ -11,17 +11,19 @@ from lightning import Trainer
 from mlflow.entities import Run
 from rich.console import Console
 
+from conflow.scene.task import Task
 from conflow.tracking import checkpoints, recording, resume, store
 from conflow.tracking.checkpoints import AtomicCheckpointIO, Checkpoints
 from conflow.training import summary
-from conflow.training.build import fitted
+from conflow.training.build import fitted, labels
 from conflow.training.callbacks import TrainingLog, TrainingProgress, ValidationSamples
 from conflow.training.config import SPLITS, Config, SplitName, flatten
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import Evaluation, evaluate
-from conflow.training.module import ConFlow, DivergedError
+from conflow.training.model import ConFlow
+from conflow.training.model_file import MODEL_FILE
+from conflow.training.module import DivergedError, Training
 from conflow.training.progress import ProgressDisplay
-from conflow.training.reload import MODEL_FILE
 
 Draw = Callable[[ConFlow, DemonstrationData, Evaluation, Path], None]
 """Writes pictures of a trained model, its demonstrations and its samples of the validation split into a folder."""
@@ -34,6 +36,7 @@ def train(
     any_code: bool = False,
     split: SplitName = "val",
     draw: Draw | None = None,
+    task: Task | None = None,
 ) -> str:
     """Train, sample, evaluate and log one experiment; the id of its run.
 
@@ -46,6 +49,7 @@ def train(
         any_code: go on with it also where other code began it.
         split: the one whose results are printed.
         draw: makes pictures for the run.
+        task: what it is about; by default what the config names.
 
     Raises:
         DemonstrationError: before anything is tracked.
@@ -54,8 +58,9 @@ def train(
         DivergedError: a loss or gradient was not finite.
     """
     lightning.seed_everything(config.seed, verbose=False)
-    data = DemonstrationData(config)
-    model = ConFlow(fitted(config, data.train.feasible().x), data.T, data.D)
+    data = DemonstrationData(config, task)
+    console.print(understood(data), highlight=False, soft_wrap=True)
+    model = Training(fitted(config, data.train.feasible().x), data.task)
     model.fit(data.train.feasible().x)
     interrupted = resume.find(wanted) if wanted else None
     asked = experiment(config, data)
@@ -83,14 +88,29 @@ def train(
             if draw is not None:
                 draw(model, data, validated, Path(folder, "figures"))
             logger.log_files(folder)
-    title = f"{config.ablation}-s{config.seed}, preset {config.preset}, {SPLITS[split]} split"
+    title = f"{config.name}, preset {config.preset}, {SPLITS[split]} split"
     console.print(summary.results_table((validated if split == "val" else tested).results, title))
     return run_id
+
+
+def understood(data: DemonstrationData) -> str:
+    """What is learned from, in a line or two: a forgotten radius and swapped axes are seen by it."""
+    task, (N, T, _) = data.task, data.x.shape
+    robots = f"{task.robots.count} robot{'s' if task.robots.count > 1 else ''}"
+    kept = ", ".join(
+        f"{int(one.violation(data.x).sum()) / N:.1%} violate {name}" for name, one in task.constraints().items()
+    )
+    text = f"{N} trajectories x {T} waypoints x {robots}: {kept}"
+    disagree = int((data.violates != labels(data.config, task).violation(data.x)).sum())
+    if task.robots.D > T:
+        text += f"\nThere are more numbers in a configuration, {task.robots.D}, than waypoints: are both exchanged?"
+    return f"{text}\n{disagree} of the given labels disagree with the constraint" if disagree else text
 
 
 def experiment(config: Config, data: DemonstrationData) -> recording.Experiment:
     """What a run of these settings on these demonstrations is recorded as."""
     tags = {
+        "task": config.task_name,
         "ablation": config.ablation,
         "preset": config.preset,
         "seed": str(config.seed),
@@ -101,9 +121,7 @@ def experiment(config: Config, data: DemonstrationData) -> recording.Experiment:
     }
     params = {key: str(value) for key, value in flatten(config.identity()).items()}
     x, violates = data.x.numpy(), data.violates.numpy()
-    return recording.Experiment(
-        f"{config.ablation}-s{config.seed}", tags, params, config.tree(), data.origin, x, violates
-    )
+    return recording.Experiment(config.name, tags, params, config.tree(), data.origin, x, violates)
 
 
 def _continued(run: Run, asked: recording.Experiment, config: Config, console: Console, any_code: bool) -> Path | None:

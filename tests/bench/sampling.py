@@ -9,17 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from conflow.flow.sampler import Field, Solver, integrate
+from conflow.flow.sampler import Field, integrate
+from conflow.flow.settings import Solver
 from conflow.planner import Planner
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
 from conflow.training import config
-from conflow.training.build import fitted, robot_avoidance
+from conflow.training.build import fitted
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.diagnostics import EVALUATIONS
 from conflow.training.evaluation import LATENCY_BATCH, cycle
-from conflow.training.module import ConFlow
+from conflow.training.model import ConFlow
 from tests.bench import peers
 from tests.bench.clock import Block, Pace, Row, Target, alone, alternate, beside, block
+from tests.papers import label, model_of
 
 SAMPLES = 2048
 MILLION = 1_000_000
@@ -45,7 +47,7 @@ def source(pace: Pace) -> list[Row]:
 def correction(pace: Pace) -> list[Row]:
     """The gradient and the correction in closed form beside autograd's."""
     model, x = _model()
-    x, constraint = cycle(x, SAMPLES), robot_avoidance(model.config, model.D)
+    x, constraint = cycle(x, SAMPLES), label(model.config, model.D)
 
     def autograd() -> Tensor:
         leaf = x.clone().requires_grad_()
@@ -96,7 +98,7 @@ def plan(pace: Pace) -> list[Row]:
 def demonstrations() -> list[Row]:
     """Generating and labelling a million."""
     settings = config.load()
-    constraint = robot_avoidance(settings, 4)
+    constraint = label(settings, 4)
     seconds = [block(lambda: constraint.violation(swap(MILLION)))(1) for _ in range(3)]
     return [alone("demonstrations", "generating and labelling a million", seconds)]
 
@@ -120,7 +122,7 @@ def _model(ablation: str = "cgp") -> tuple[ConFlow, Tensor]:
     settings = config.load(["preset=quick", f"ablation={ablation}"])
     data = DemonstrationData(settings)
     feasible = data.train.feasible().x
-    model = ConFlow(fitted(settings, feasible), data.T, data.D).eval()
+    model = model_of(fitted(settings, feasible), data.T, data.D).eval()
     model.fit(feasible)
     return model.requires_grad_(False), data.x
 

@@ -19,12 +19,12 @@ from conflow.tracking import recording
 from conflow.training import config
 from conflow.training.config import Config
 from conflow.training.datamodule import DemonstrationData
-from conflow.training.module import ConFlow
 from conflow.training.progress import ProgressDisplay
 from conflow.training.train import experiment, trainer
 from tests.bench import peers
 from tests.bench.clock import Block, Pace, Row, Target, alternate, beside, block, compared
 from tests.bench.peers import StraightPath
+from tests.papers import model_of
 
 RAW, FULL_RATE = "raw PyTorch loop", "its matrix products alone, at full rate"
 TARGETS = {"paper": {RAW: Target(1.03), FULL_RATE: Target(1 / 0.8)}, "quick": {RAW: Target(1.1)}}
@@ -92,7 +92,7 @@ class RawLoop:
 
     def __init__(self, settings: Config, path: StraightPath | None = None) -> None:
         data = DemonstrationData(settings)
-        self.model, self.path, self.batch_size = ConFlow(settings, data.T, data.D), path, settings.train.batch_size
+        self.model, self.path, self.batch_size = model_of(settings, data.T, data.D), path, settings.train.batch_size
         self.x, self.violates = data.train
         source, constraint = settings.source, settings.constraint
         K, ends = rbf(data.T, source.length_scale, source.sigma_f, source.epsilon), [0, data.T - 1]
@@ -146,7 +146,7 @@ class Loop:
     def __init__(self, settings: Config) -> None:
         self.settings = settings
         self.data = DemonstrationData(settings)
-        self.model = ConFlow(settings, self.data.T, self.data.D)
+        self.model = model_of(settings, self.data.T, self.data.D)
         self.tracked = recording.start(experiment(settings, self.data))
 
     def __enter__(self) -> "Loop":

@@ -15,7 +15,7 @@ from conflow.tracking import recording
 from conflow.tracking.checkpoints import Checkpoints
 from conflow.training import config, evaluation
 from conflow.training.callbacks import ValidationSamples
-from conflow.training.module import ConFlow
+from conflow.training.module import Training
 from conflow.training.train import train
 from tests.bench.clock import Row, Target, compared
 
@@ -28,8 +28,8 @@ SECTIONS: dict[str, list[tuple[Any, str]]] = {
     ],
     "pictures": [(workspace, "of_training")],
     "checkpoints": [(Checkpoints, "_save")],
-    "validation": [(ConFlow, "validation_step"), (ValidationSamples, "on_validation_end")],
-    "sampling": [(ConFlow, "flow")],
+    "validation": [(Training, "validation_step"), (ValidationSamples, "on_validation_end")],
+    "sampling": [(Training, "flow")],
     "latencies": [(evaluation, "_latency_ms")],
 }
 """What each of them consists of; of one that is called within another, the outer one has the time."""

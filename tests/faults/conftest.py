@@ -13,8 +13,8 @@ from conflow import __main__ as command_line
 from conflow.tracking import signals, store
 from conflow.training import config
 from conflow.training.datamodule import DemonstrationData
-from conflow.training.module import ConFlow
-from conflow.training.reload import MODEL_FILE
+from conflow.training.model_file import MODEL_FILE
+from tests.papers import model_of
 
 RUN = "cgp-s0"
 
@@ -70,7 +70,7 @@ def finished_run(name: str, folder: Path) -> str:
     settings = config.load(["preset=smoke"])
     data = DemonstrationData(settings)
     torch.manual_seed(0)
-    model = ConFlow(settings, data.T, data.D)
+    model = model_of(settings, data.T, data.D)
     described = {"config": settings.tree(), "T": data.T, "D": data.D, "threads": 1}
     torch.save({"conflow": described, "state_dict": model.state_dict()}, folder / MODEL_FILE)
     client = store.client()

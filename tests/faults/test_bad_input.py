@@ -23,11 +23,11 @@ import torch
 
 from conflow.errors import ConfigError
 from conflow.planner import PlanError, Planner
-from conflow.scene.constraint import Obstacle
+from conflow.scene.settings import Obstacle
 from conflow.training import config
-from conflow.training.module import ConFlow
-from conflow.training.reload import MODEL_FILE
+from conflow.training.model_file import MODEL_FILE
 from tests.faults.conftest import RUN, Run, assert_refused, listing
+from tests.papers import model_of
 
 HUGE = "1" + "0" * 400
 PAIR = ("start=-0.8,0,0.8,0", "goal=0.8,0,-0.8,0")
@@ -551,7 +551,7 @@ def test_in_a_process_of_its_own(arguments: tuple[str | bytes, ...], output: str
 @pytest.fixture(scope="module")
 def planner() -> Planner:
     torch.manual_seed(0)
-    return Planner(ConFlow(config.load(["preset=smoke"]), 32, 4))
+    return Planner(model_of(config.load(["preset=smoke"]), 32, 4))
 
 
 GOOD: dict[str, Any] = {"start": (-0.8, 0.0, 0.8, 0.0), "goal": (0.8, 0.0, -0.8, 0.0), "num": 2}

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from conflow.tracking import checkpoints
-from conflow.tracking.checkpoints import AtomicCheckpointIO, CheckpointError
+from conflow.tracking import checkpoint_file, checkpoints
+from conflow.tracking.checkpoint_file import CheckpointError
+from conflow.tracking.checkpoints import AtomicCheckpointIO
 from tests.faults import processes
 from tests.faults.processes import history, runs, weights
 
@@ -44,8 +45,8 @@ def test_the_newest_checkpoint_and_the_one_before_are_kept(tmp_path: Path) -> No
     for number in range(3):
         io.save_checkpoint(checkpoint(number), tmp_path / checkpoints.LAST)
     assert sorted(path.name for path in tmp_path.iterdir()) == [checkpoints.LAST, checkpoints.PREVIOUS]
-    assert checkpoints.load(tmp_path / checkpoints.LAST)["number"] == 2
-    assert checkpoints.load(tmp_path / checkpoints.PREVIOUS)["number"] == 1
+    assert checkpoint_file.load(tmp_path / checkpoints.LAST)["number"] == 2
+    assert checkpoint_file.load(tmp_path / checkpoints.PREVIOUS)["number"] == 1
 
 
 def test_a_full_disk_leaves_the_checkpoint_that_was_there_and_nothing_else(disk: Path) -> None:
@@ -59,7 +60,7 @@ def test_a_full_disk_leaves_the_checkpoint_that_was_there_and_nothing_else(disk:
         f"{path}: expected to write a checkpoint, found {os.strerror(errno.ENOSPC)}; kept the one before it, {path}"
     )
     assert sorted(file.name for file in disk.iterdir()) == [checkpoints.LAST, "others"]
-    assert checkpoints.load(path)["number"] == 0
+    assert checkpoint_file.load(path)["number"] == 0
 
 
 def test_a_training_that_fills_the_disk_ends_in_one_line_and_goes_on_when_there_is_room(disk: Path) -> None:
@@ -92,7 +93,7 @@ def test_a_truncated_checkpoint_is_refused_by_name(kept: float, tmp_path: Path) 
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content)) if isinstance(kept, float) else kept])
     with pytest.raises(CheckpointError, match=r"last\.ckpt: expected a checkpoint of ConFlow, found a damaged"):
-        checkpoints.load(path)
+        checkpoint_file.load(path)
 
 
 def test_a_foreign_file_is_refused_by_name(tmp_path: Path) -> None:
@@ -104,9 +105,9 @@ def test_a_foreign_file_is_refused_by_name(tmp_path: Path) -> None:
     torch.save([1, 2], tmp_path / "list")
     for name in ("text", "pickle", "zip", "torch", "list"):
         with pytest.raises(CheckpointError, match=rf"{name}: expected a checkpoint of ConFlow"):
-            checkpoints.load(tmp_path / name)
+            checkpoint_file.load(tmp_path / name)
     with pytest.raises(FileNotFoundError):
-        checkpoints.load(tmp_path / "missing")
+        checkpoint_file.load(tmp_path / "missing")
 
 
 class Bomb:
@@ -125,7 +126,7 @@ def test_loading_a_checkpoint_runs_no_code_from_it(tmp_path: Path) -> None:
     torch.load(bomb, weights_only=False)  # it is a live one
     (tmp_path / "exploded").rmdir()
     with pytest.raises(CheckpointError):
-        checkpoints.load(bomb)
+        checkpoint_file.load(bomb)
     with pytest.raises(CheckpointError):
         AtomicCheckpointIO().load_checkpoint(bomb, weights_only=False)
     assert checkpoints.newest(tmp_path)[0] is None

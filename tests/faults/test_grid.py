@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 import conflow
-from conflow.scene.constraint import RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
 from tests.faults import processes
 from tests.faults.processes import runs
+from tests.papers import keep_apart
 
 GRID = ("ablations", "preset=smoke", "seeds=0", "ablations=cgp fm")
 
@@ -53,7 +52,7 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 def test_a_cell_that_died_as_it_was_begun_goes_on_as_the_same_run(tmp_path: Path) -> None:
     begun = ("train", "preset=smoke", "ablation=fm", "seed=0")
-    death = processes.killed_in("conflow.tracking.store", "_describe")
+    death = processes.killed_in("conflow.tracking.recording", "_describe")
     assert processes.run(tmp_path, *begun, death=death)[0] == -signal.SIGKILL
     code, said = processes.run(tmp_path, "ablations", "preset=smoke", "seeds=0", "ablations=fm")
     assert code == 0, said
@@ -90,7 +89,7 @@ def test_changed_code_is_trained_anew_and_a_changed_comment_is_not(tmp_path: Pat
 
 def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
     x = swap(600)
-    feasible = x[~RobotAvoidance(PointRobots(2)).violation(x)]
+    feasible = x[~keep_apart(2).violation(x)]
     np.savez(tmp_path / "feasible.npz", x=feasible.numpy())
     code, output = processes.run(tmp_path, *GRID, "data.path=feasible.npz")
     assert code == 2

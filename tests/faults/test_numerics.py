@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from conflow.flow.settings import Source as Settings
 from conflow.flow.source import ENDPOINTS, Source, fit_rbf, rbf
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
 from conflow.training.build import build_source
-from conflow.training.config import Source as Settings
 
 LENGTH_SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 LENGTHS = (2, 3, 4, 5, 8, 16, 31, 32, 33, 64, 128, 512)

@@ -15,11 +15,14 @@ from torch import Tensor
 
 from conflow.errors import ConfigError
 from conflow.flow.source import Source, rbf
-from conflow.scene.constraint import Barrier, Obstacle, ObstacleAvoidance, RobotAvoidance
-from conflow.scene.robots import PointRobots
-from conflow.scene.trajectories import DemonstrationError, check, load, swap
+from conflow.scene.constraint import Barrier
+from conflow.scene.demonstrations import check, load
+from conflow.scene.errors import DemonstrationError
+from conflow.scene.settings import Obstacle
+from conflow.scene.tasks.swap import swap
 from conflow.training import config
 from conflow.training.config import Config, Range
+from tests.papers import keep_apart, keep_clear
 
 some = settings(derandomize=True, deadline=None, max_examples=100, suppress_health_check=[HealthCheck.too_slow])
 many = settings(some, max_examples=80)
@@ -140,7 +143,7 @@ ROUNDING = 1e-6  # the radius is in single precision
 def test_clearance_knows_neither_place_nor_direction_nor_whose_turn_it_is(
     x: Tensor, angle: float, right: float, up: float, order: list[int]
 ) -> None:
-    avoidance = RobotAvoidance(PointRobots(3), 0.3)
+    avoidance = keep_apart(3, 0.3)
     c = avoidance.clearance(x)
     moved = turned(x, angle, torch.tensor([right, up], dtype=x.dtype))
     torch.testing.assert_close(avoidance.clearance(moved), c, rtol=0, atol=ROUNDING)
@@ -152,8 +155,8 @@ def test_clearance_knows_neither_place_nor_direction_nor_whose_turn_it_is(
 @some
 @given(trajectories(), st.floats(0.05, 1), st.floats(-1, 1), st.floats(-1, 1))
 def test_clearance_is_the_gap_between_discs(x: Tensor, radius: float, right: float, up: float) -> None:
-    robots = RobotAvoidance(PointRobots(2), radius).clearance(x)
-    obstacle = ObstacleAvoidance(PointRobots(2), [Obstacle(right, up, radius)], 0.15).clearance(x)
+    robots = keep_apart(2, radius).clearance(x)
+    obstacle = keep_clear(2, [Obstacle(right, up, radius)], 0.15).clearance(x)
     for b, path in enumerate(x.tolist()):
         for i, (x1, y1, x2, y2) in enumerate(path):
             assert math.isclose(robots[b, i], math.hypot(x1 - x2, y1 - y2) - radius, abs_tol=ROUNDING)
@@ -165,7 +168,7 @@ def test_clearance_is_the_gap_between_discs(x: Tensor, radius: float, right: flo
 @given(trajectories())
 def test_swept_clearance_is_the_smallest_of_the_way_between(x: Tensor) -> None:
     """Never above what any point between the waypoints has, and nearly reached by one of a hundred."""
-    avoidance = RobotAvoidance(PointRobots(2), 0.3)
+    avoidance = keep_apart(2, 0.3)
     share = torch.linspace(0, 1, 101, dtype=x.dtype)[:, None, None, None]
     between = torch.stack([avoidance.clearance(y) for y in torch.lerp(x[:, :-1], x[:, 1:], share)]).amin(dim=0)
     swept = avoidance.swept_clearance(x)
@@ -180,7 +183,7 @@ def test_the_barrier_is_at_most_zero_and_its_gradient_leads_out(
     x: Tensor, seed: int, shape: Any, reduction: Any
 ) -> None:
     """Along the gradient C does not fall, and no step of length h changes a clearance by more than sqrt(2) h."""
-    avoidance = RobotAvoidance(PointRobots(2), 0.3, Barrier(shape, reduction))
+    avoidance = keep_apart(2, 0.3, Barrier(shape, reduction))
     c, C, g = avoidance.clearance(x), avoidance.barrier(x), avoidance.gradient(x)
     assert bool((C <= 0).all())
     assert bool(g.isfinite().all())
@@ -195,7 +198,7 @@ def test_the_barrier_is_at_most_zero_and_its_gradient_leads_out(
 @some
 @given(trajectories(), st.sampled_from([math.nan, math.inf, -math.inf]), st.data())
 def test_what_is_no_number_violates(x: Tensor, value: float, data: st.DataObject) -> None:
-    avoidance = RobotAvoidance(PointRobots(2), 0.3)
+    avoidance = keep_apart(2, 0.3)
     x.view(-1)[data.draw(st.integers(0, x.numel() - 1))] = value
     c = avoidance.clearance(x)
     assert bool(avoidance.violation(x)[~c.isfinite().all(dim=1) & c.isnan().any(dim=1)].all())

@@ -8,7 +8,7 @@ import pytest
 import torch
 from mlflow.entities import Run
 
-from conflow.scene.trajectories import swap
+from conflow.scene.tasks.swap import swap
 from conflow.tracking import liveness
 from tests.faults import processes
 from tests.faults.processes import Death, checkpoint_folder, history, killed_in, runs, store, weights
@@ -47,7 +47,7 @@ def whole(folder: Path) -> Run:
         killed_in("pathlib", "Path.replace", call=2),
         killed_in("pathlib", "Path.replace", call=5),
         killed_in("conflow.training.train", "evaluate"),
-        killed_in("conflow.figures", "save"),
+        killed_in("conflow.figures.workspace", "save"),
     ],
     ids=[
         "before it had a config",

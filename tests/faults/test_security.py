@@ -23,7 +23,7 @@ from conflow.errors import ConfigError
 from conflow.tracking import store
 from conflow.training import config
 from conflow.training.config import CONF
-from conflow.training.reload import MODEL_FILE
+from conflow.training.model_file import MODEL_FILE
 from tests.faults.conftest import RUN, Run, assert_refused, listing
 
 PAIR = ("start=-0.8,0,0.8,0", "goal=0.8,0,-0.8,0")

@@ -1,0 +1,76 @@
+"""What the commands do, from Python: train an experiment, compare the finished ones."""
+
+from typing import TYPE_CHECKING, Any
+
+from conflow.training import config
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from conflow.scene.task import Task
+
+
+def train(task: "Task | str" = config.PAPERS_TASK, ablation: str = "cgp", **settings: Any) -> str:
+    """Train, sample, evaluate and track one experiment, as `make train` does; the id of its MLflow run.
+
+    Args:
+        task: a task of one's own, or the name of one, or the file of one.
+        ablation: the method.
+        settings: `preset`, `seed`, and any other; those with a dot in their name with two underscores in its place, as
+            in `train__max_steps=100`.
+
+    Raises:
+        ConfigError: a setting that cannot be used.
+        DemonstrationError: demonstrations that cannot be used.
+    """
+    chosen = config.load([*_task(task), f"ablation={ablation}", *_arguments(settings)])
+
+    from rich.console import Console
+
+    from conflow.figures.workspace import of_training
+    from conflow.training.build import checked
+    from conflow.training.memory import check_training
+    from conflow.training.train import train
+
+    check_training(chosen)
+    own = None if isinstance(task, str) else checked(task, task.name)
+    return train(chosen, Console(), draw=of_training, task=own)
+
+
+def compare(
+    task: "Task | str" = config.PAPERS_TASK, split: config.SplitName = "val", **settings: Any
+) -> "pd.DataFrame":
+    """The tables of `make compare`, a row for each number: of the newest finished run of every ablation and seed.
+
+    Columns are table, row, column, value, its interval over seeds low and high, count, trajectories, and the rest of
+    `results.tables.Cell`.
+
+    Args:
+        task: as in `train`.
+        split: whose starts and goals the models were given.
+        settings: with which the runs were trained, `preset` among them.
+
+    Raises:
+        ConfigError: there is no such run.
+    """
+    import pandas as pd
+
+    from conflow.results.comparison import collect
+
+    arguments = [*_task(task), *_arguments(settings)]
+    preset = config.load(arguments).preset
+    found = collect(preset, [one for one in arguments if not one.startswith("preset=")], split)
+    return pd.DataFrame(found.cells)
+
+
+def _task(task: "Task | str") -> list[str]:
+    """The argument that names a task. One of a file is known by it, so that runs from there and from here are equal."""
+    if isinstance(task, str):
+        return [f"task={task}"]
+    from conflow.training.build import file_of
+
+    return [f"task={file_of(task)}"]
+
+
+def _arguments(settings: dict[str, Any]) -> list[str]:
+    return [f"{key.replace('__', '.')}={'null' if value is None else value}" for key, value in settings.items()]

@@ -1,0 +1,46 @@
+"""`make demonstrations`: files for data.path, from a task's own generator or from tracked people and robots."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from conflow import commandline
+from conflow.errors import ConfigError
+from conflow.scene.demonstrations import Demonstrations, save
+from conflow.training import config
+from conflow.training.build import build_task
+
+
+def from_task(options: Mapping[str, str]) -> str:
+    """Write what the task of the options demonstrates; what is said of it.
+
+    Raises:
+        ConfigError: an option that cannot be used.
+        DemonstrationError: the file cannot be written.
+    """
+    num, seed = commandline.whole(options, "num", 10, 10**5), commandline.whole(options, "seed", 0, 2**32 - 1)
+    settings = config.load([f"task={options['task']}"])
+    out = options["out"] or f"{settings.task_name}.npz"
+    made = build_task(settings).demonstrations(num, seed)
+    save(out, made if isinstance(made, Demonstrations) else Demonstrations(made, None))
+    return f"Written: {out}; train on it with: make train ARGS=data.path={out}"
+
+
+def from_tracks(options: Mapping[str, str]) -> str:
+    """Write the windows of a file of tracks in which agents meet; what was found in it.
+
+    Raises:
+        ConfigError: an option or the file cannot be used.
+        DemonstrationError: the file cannot be written.
+    """
+    from conflow.training import tracks  # which needs SciPy
+
+    opposite = commandline.whole(options, "opposite", 0, 1) == 1
+    fps = commandline.number(options, "fps") if options["fps"] else None
+    agents, T = commandline.whole(options, "agents", 1, 99), commandline.whole(options, "T", 3, 4096)
+    found = tracks.read(options["from"], agents, commandline.number(options, "seconds"), T, fps, opposite)
+    out = options["out"] or f"{Path(options['from']).stem}.npz"
+    if Path(out) == Path(options["from"]):
+        raise ConfigError(f"out={out}: expected another file than from")
+    save(out, Demonstrations(found.x, None, found.scale, found.offset.tolist(), found.seconds))
+    advice = f"train on it with: make train ABLATION=plus ARGS='data.path={out} constraint.radius=...'"
+    return f"{found.summary}\nWritten: {out}; {advice}"

@@ -1,0 +1,48 @@
+"""A picture of plans."""
+
+from collections.abc import Sequence
+
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above
+from conflow.planner import Planner, Plans
+
+PER_ROW = 3
+"""Entries of the legend in a row; more would be cut off."""
+
+
+def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]] = ()) -> Figure:
+    """The plans of one pair, each robot's in its colour, collisions on top in another, and the best plan in bold.
+
+    Args:
+        planner: whose plans they are.
+        plans: in the user's units.
+        obstacles: discs (x, y, radius) in the same.
+    """
+    figure = Figure(figsize=(4.6, 5.4), layout="constrained")
+    axis = figure.add_subplot(aspect="equal")
+    robots, reach = planner.model.task.robots, 1.05 * planner.scale
+    middle = [float(zero) for zero in planner.offset[:2]]
+    axis.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[-1] - reach, middle[-1] + reach))
+    axis.set(xlabel="x", ylabel="y")
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.set_title(f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible")
+    paths = seen_from_above(robots, plans.x)
+    for body, robot in enumerate(robots.owner.tolist()):
+        colour = ROBOTS[robot % len(ROBOTS)]
+        for shown, drawn in ((plans.feasible, colour), (~plans.feasible, COLLISION)):
+            axis.add_collection(LineCollection(list(paths[shown, :, body].numpy()), colors=drawn, alpha=0.4, lw=0.9))
+        axis.plot(*paths[0, :, body].T, color=colour if plans.feasible[0] else COLLISION, lw=2.5)
+        axis.plot(*paths[0, 0, body], "o", color=colour, zorder=3, label=f"robot {robot + 1}")
+        # A ring, so that in a swap it does not hide the other robot's start.
+        axis.plot(*paths[0, -1, body], "o", color=colour, zorder=3, ms=11, mfc="none", mew=2)
+    axis.plot([], [], color=COLLISION, label="not feasible")
+    axis.plot([], [], "o", color="black", ms=11, mfc="none", mew=2, label="goal")
+    for x, y, radius in obstacles:
+        axis.add_patch(Circle((x, y), radius, color=OBSTACLE, zorder=2.5))
+    handles, labels = axis.get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))  # each robot once, however many bodies it has
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=PER_ROW, frameon=False)
+    return figure

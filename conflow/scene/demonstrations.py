@@ -1,0 +1,152 @@
+"""Demonstrations: files of them, and what makes them valid."""
+
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from conflow.scene.errors import DemonstrationError
+
+NUMBERS: dict[str, tuple[tuple[int, ...], float | list[float]]] = {
+    "scale": ((), 1.0),
+    "offset": ((2,), [0.0, 0.0]),
+    "seconds": ((), 1.0),
+}
+"""What a file may say beside its trajectories: the shape, and what holds where it does not."""
+
+
+class Demonstrations(NamedTuple):
+    """Trajectories and what their author says of them.
+
+    Attributes:
+        x: (N, T, D), in workspace units.
+        violates: M, boolean (N,), where they are labelled.
+        scale, offset: the user's coordinates are `scale` x + `offset`, a number for each of the plane's two axes.
+        seconds: how long one takes.
+    """
+
+    x: Tensor
+    violates: Tensor | None = None
+    scale: float = 1.0
+    offset: Sequence[float] = (0.0, 0.0)
+    seconds: float = 1.0
+
+
+def load(path: str | Path) -> Demonstrations:
+    """Demonstrations from an .npz file: `x` (N, T, D), and optionally `violates`, boolean (N,), and numbers.
+
+    These are `scale`, `offset` (2,) and `seconds`, see `Demonstrations`.
+
+    Raises:
+        DemonstrationError: the file is missing or unreadable, or its arrays are not of that kind.
+    """
+    try:
+        if not Path(path).is_file():  # of a pipe, reading would never end
+            raise FileNotFoundError
+        with np.load(path, allow_pickle=False) as file:
+            # What of a foreign archive is no array comes as bytes.
+            arrays = {name: np.asarray(file[name]) for name in ("x", "violates", *NUMBERS) if name in file}
+    except FileNotFoundError:
+        raise DemonstrationError(f"data.path={path}: no such file, expected an .npz file with numeric arrays") from None
+    except MemoryError as error:
+        raise DemonstrationError(f"data.path={path}: {error}, expected arrays that fit into memory") from None
+    except Exception:  # a damaged file fails in any of a dozen ways, from zlib.error to TokenError
+        raise DemonstrationError(f"data.path={path}: expected an .npz file with numeric arrays") from None
+    if "x" not in arrays:
+        raise DemonstrationError(f"data.path={path}: expected an array named x of shape (N, T, D)")
+    x, violates = arrays["x"], arrays.get("violates")
+    if not np.issubdtype(x.dtype, np.floating):
+        raise DemonstrationError(f"data.path={path}: x holds {x.dtype}, expected floating-point numbers")
+    if violates is not None and (violates.dtype != np.bool_ or violates.shape != x.shape[:1]):
+        raise DemonstrationError(
+            f"data.path={path}: violates holds {violates.dtype} of shape {violates.shape}, "
+            f"expected bool of shape {x.shape[:1]}"
+        )
+    with np.errstate(over="ignore"):  # `check` refuses what becomes infinite
+        x = x.astype(np.float32)
+    labels = None if violates is None else torch.from_numpy(violates)
+    return Demonstrations(torch.from_numpy(x), labels, *_numbers(path, arrays))
+
+
+def _numbers(path: str | Path, arrays: Mapping[str, np.ndarray]) -> tuple[float, list[float], float]:
+    """Scale, offset and seconds, where a file has them."""
+    values = []
+    for name, (shape, default) in NUMBERS.items():
+        array = arrays.get(name, np.array(default))
+        numeric = np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
+        if array.shape != shape or not numeric or not np.isfinite(array).all():
+            raise DemonstrationError(
+                f"data.path={path}: {name} has shape {array.shape}, expected {shape}, finite numbers"
+            )
+        values.append(array.tolist())
+    scale, offset, seconds = values
+    if not (scale > 0 and seconds > 0):
+        raise DemonstrationError(f"data.path={path}: scale={scale}, seconds={seconds}: expected numbers above 0")
+    return float(scale), [float(zero) for zero in offset], float(seconds)
+
+
+def check(x: Tensor, name: str) -> None:
+    """Refuse trajectories x that are not (N, T, D), finite and inside the workspace, [-1, 1] in every number.
+
+    Raises:
+        DemonstrationError: names `name`, what was found and what was expected.
+    """
+    if x.ndim != 3 or x.shape[1] < 3 or x.shape[2] < 1:
+        raise DemonstrationError(
+            f"{name}: x has shape {tuple(x.shape)}, expected (N, T, D) with T >= 3 waypoints and D numbers each"
+        )
+    if not len(x):
+        raise DemonstrationError(f"{name}: x is empty, expected at least one trajectory")
+    finite = torch.isfinite(x).flatten(1).all(dim=1)
+    if not bool(finite.all()):
+        raise DemonstrationError(
+            f"{name}: {int((~finite).sum())} trajectories hold NaN or infinity, the first is "
+            f"{int((~finite).nonzero()[0])}, expected finite numbers in the workspace [-1, 1]"
+        )
+    outside = x.abs().flatten(1).amax(dim=1) > 1
+    if bool(outside.any()):
+        found = f"found {float(x.min()):.4g} to {float(x.max()):.4g}, expected all of them inside"
+        raise DemonstrationError(
+            f"{name}: {int(outside.sum())} trajectories leave the workspace [-1, 1], the first is "
+            f"{int(outside.nonzero()[0])}, {found}"
+        )
+
+
+def save(path: str | Path, made: Demonstrations) -> None:
+    """Write demonstrations as a new .npz file that `load` reads, whole or not at all.
+
+    Raises:
+        DemonstrationError: the name does not end in .npz, there is such a file, or it cannot be written.
+    """
+    if Path(path).suffix != ".npz":
+        raise DemonstrationError(f"out={path}: expected a name that ends in .npz")
+    path = Path(path)
+    try:
+        with tempfile.TemporaryDirectory(prefix=".conflow-", dir=path.parent) as folder:
+            part = Path(folder, path.name)
+            arrays: dict[str, Any] = {
+                "x": made.x.numpy(),
+                "scale": made.scale,
+                "offset": made.offset,
+                "seconds": made.seconds,
+            }
+            if made.violates is not None:
+                arrays["violates"] = made.violates.numpy()
+            np.savez(part, **arrays)
+            path.hardlink_to(part)  # which, unlike a rename, refuses to replace a file
+    except OSError as error:
+        raise DemonstrationError(f"out={path}: {error.strerror}, expected a new file in an existing folder") from None
+
+
+def digest(x: Tensor, violates: Tensor | None = None) -> str:
+    """A fingerprint of demonstrations: SHA-256 over shape and bytes, and over their author's labels, 16 hex digits."""
+    content = hashlib.sha256(str(tuple(x.shape)).encode())
+    content.update(x.contiguous().numpy().tobytes())
+    if violates is not None:
+        content.update(violates.numpy().tobytes())
+    return content.hexdigest()[:16]

@@ -1,0 +1,73 @@
+"""What an experiment is about: robots, what they must keep, and what they learn from."""
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+from torch import Tensor
+
+from conflow.scene.constraint import Constraint
+from conflow.scene.demonstrations import Demonstrations
+from conflow.scene.robots import Robots
+
+
+class Task(ABC):
+    """Subclass this to bring a task of one's own; `robots`, `constraints` and `demonstrations` are all it takes.
+
+    All is in workspace units: every number of a configuration lies in [-1, 1], with one common scale for positions, so
+    that distances stay distances. The user's coordinates are `scale` x + `offset`.
+
+    Starts and goals that models are asked for are those of demonstrations that were held out.
+
+    Attributes:
+        robots: what moves.
+        T: waypoints of a trajectory.
+        seconds: how long one takes.
+        scale: the user's units in a workspace unit.
+        offset: the user's coordinates of x = 0: a number, or one for each of D.
+    """
+
+    robots: Robots
+    T: int = 32
+    seconds: float = 1.0
+    scale: float = 1.0
+    offset: float | Sequence[float] = 0.0
+
+    @property
+    def name(self) -> str:
+        """By default that of the class, as in `two_arms` for TwoArms."""
+        return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(self).__name__).lower()
+
+    @property
+    def dt(self) -> float:
+        """Seconds from one waypoint to the next."""
+        return self.seconds / (self.T - 1)
+
+    @abstractmethod
+    def constraints(self) -> Mapping[str, Constraint]:
+        """What training keeps, by name: it labels demonstrations, corrects, guides, and is measured."""
+
+    def constraints_at_inference(self) -> Mapping[str, Constraint]:
+        """What appears at inference alone, by name: guided around where a setting says so, and measured."""
+        return {}
+
+    def settings(self) -> Mapping[str, Sequence[str]]:
+        """What is evaluated beside `none`, by name: around which constraints sampling is guided.
+
+        By default all that training keeps together, and whatever appears at inference by itself.
+        """
+        kept = tuple(self.constraints())
+        together = kept[0] if len(kept) == 1 else "all"
+        return {together: kept, **{name: (name,) for name in self.constraints_at_inference()}}
+
+    @abstractmethod
+    def demonstrations(self, num: int, seed: int) -> Tensor | Demonstrations:
+        """`num` trajectories x (num, T, D), a function of the seed, with labels if one has them."""
+
+    def judged(self) -> Mapping[str, Constraint]:
+        """All constraints by name, as samples are measured by them."""
+        return {**self.constraints(), **self.constraints_at_inference()}
+
+    def obstacles(self) -> Sequence[tuple[float, float, float]]:
+        """Discs (x, y, radius) that pictures show."""
+        return ()

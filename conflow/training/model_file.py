@@ -1,0 +1,47 @@
+"""The model that a run left in a file. Needs torch alone."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from conflow.errors import ConfigError
+from conflow.scene.task import Task
+from conflow.scene.tasks import TASKS
+from conflow.tracking import checkpoint_file
+from conflow.training import config as configuration
+from conflow.training.build import build_task
+from conflow.training.model import ConFlow
+
+MODEL_FILE = "model.ckpt"
+SAMPLING = ("sample.", "seed")
+
+
+class MissingTaskError(ConfigError):
+    """A run on a task of one's own, loaded without it."""
+
+
+def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = None) -> ConFlow:
+    """The model that a run left in `model.ckpt`, ready to sample. Reads weights and plain values, runs no code.
+
+    Args:
+        path: the file.
+        arguments: settings `sample....=value` and `seed=value` to sample with in place of the run's own.
+        task: of a run on a task of one's own: the file of a run is not asked which code to run.
+
+    Raises:
+        ConfigError: an argument that is none of these.
+        MissingTaskError: the task is none of the program's, and not given.
+        CheckpointError: the file is damaged or foreign.
+    """
+    checkpoint = checkpoint_file.load(path)
+    described = checkpoint["conflow"]
+    config = configuration.from_tree(described["config"])
+    if arguments:
+        config = configuration.override(config, arguments, SAMPLING)
+    if task is None and config.task not in TASKS:
+        expected = f"expected the file or the object of task {config.task_name}, which no checkpoint holds"
+        raise MissingTaskError(f"task: {expected}; try: task={Path(config.task).name}")
+    task = task or build_task(config, described["T"], described["D"])
+    task.scale, task.offset = described["scale"], described["offset"]
+    model = ConFlow(config, task)
+    model.load_state_dict(checkpoint["state_dict"])
+    return model.eval()
