@@ -195,7 +195,7 @@ def demonstrations(arguments: list[str]) -> None:
     from conflow.tracking import signals
 
     signals.raise_on_signals()
-    defaults = {"task": "swap", "from": "", "out": "", "num": "3000", "seed": "0"}
+    defaults = {"task": "swap", "from": "", "out": "NAME.npz", "num": "3000", "seed": "0"}
     tracked = {"agents": "2", "seconds": "6", "T": "32", "fps": "", "opposite": "1"}
     options, _ = commandline.options(arguments, defaults | tracked, settings=False)
 

@@ -19,10 +19,15 @@ def from_task(options: Mapping[str, str]) -> str:
     """
     num, seed = commandline.whole(options, "num", 10, 10**5), commandline.whole(options, "seed", 0, 2**32 - 1)
     settings = config.load([f"task={options['task']}"])
-    out = options["out"] or f"{settings.task_name}.npz"
+    out = _named(options, settings.task_name)
     made = build_task(settings).demonstrations(num, seed)
     save(out, made if isinstance(made, Demonstrations) else Demonstrations(made, None))
     return f"Written: {out}; train on it with: make train ARGS=data.path={out}"
+
+
+def _named(options: Mapping[str, str], name: str) -> str:
+    """The file that is asked for, or the one of this name."""
+    return f"{name}.npz" if options["out"] == "NAME.npz" else options["out"]
 
 
 def from_tracks(options: Mapping[str, str]) -> str:
@@ -38,7 +43,7 @@ def from_tracks(options: Mapping[str, str]) -> str:
     fps = commandline.number(options, "fps") if options["fps"] else None
     agents, T = commandline.whole(options, "agents", 1, 99), commandline.whole(options, "T", 3, 4096)
     found = tracks.read(options["from"], agents, commandline.number(options, "seconds"), T, fps, opposite)
-    out = options["out"] or f"{Path(options['from']).stem}.npz"
+    out = _named(options, Path(options["from"]).stem)
     if Path(out) == Path(options["from"]):
         raise ConfigError(f"out={out}: expected another file than from")
     save(out, Demonstrations(found.x, None, found.scale, found.offset.tolist(), found.seconds))

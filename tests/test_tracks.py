@@ -159,7 +159,15 @@ def test_the_command_writes_a_file_that_brings_plans_back_into_metres(place: Pat
     """The radius that the summary names for half of the windows labels so many."""
     rows = [(10 * k + who, f + 300 * k, x, y * (1 + k / 10)) for k in range(20) for who, f, x, y in meeting((0, 1))]
     written(place / "tracks.txt", rows)
-    options = {"from": "tracks.txt", "out": "", "agents": "2", "seconds": "4", "T": str(T), "fps": "", "opposite": "1"}
+    options = {
+        "from": "tracks.txt",
+        "out": "NAME.npz",
+        "agents": "2",
+        "seconds": "4",
+        "T": str(T),
+        "fps": "",
+        "opposite": "1",
+    }
     said = from_tracks(options)
     loaded = load("tracks.npz")
     assert "Written: tracks.npz" in said

@@ -267,5 +267,5 @@ def test_the_workspaces_border_belongs_to_it() -> None:
 
 @pytest.mark.parametrize("D", [2, 5])
 def test_a_swap_needs_two_robots_and_two_numbers_for_each(D: int) -> None:
-    with pytest.raises(DemonstrationError, match=rf"task swap: x has shape \(N, 32, {D}\), expected .* two robots or"):
+    with pytest.raises(DemonstrationError, match=rf"x has shape \(N, 32, {D}\), expected .* two robots or"):
         Swap(32, D)

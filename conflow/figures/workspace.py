@@ -215,7 +215,8 @@ def _clearances(axis: Axes, x: Tensor, model: ConFlow) -> None:
     for shown, colour in ((~violates, "#666666"), (violates, COLLISION)):
         axis.plot(s, c[shown].T, color=colour, alpha=0.5, lw=0.9)
     axis.axhline(0, color="black", ls="--", lw=1)
-    axis.set(xlim=(0, 1), ylim=(None, None), aspect="auto")
+    axis.set(xlim=(0, 1), aspect="auto")
+    axis.autoscale(axis="y")
     axis.set(xlabel="s (trajectory time)", ylabel="clearance")
     axis.set_box_aspect(1)
     axis.spines[["top", "right"]].set_visible(False)

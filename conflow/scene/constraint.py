@@ -113,7 +113,10 @@ class Constraint(nn.Module, ABC):
         """
         tau = torch.arange(PARTS, dtype=x.dtype, device=x.device)[:, None] / PARTS
         between = torch.lerp(x[:, :-1, None], x[:, 1:, None], tau).flatten(1, 2)
-        return self.clearance(torch.cat([between, x[:, -1:]], dim=1)).unfold(1, PARTS + 1, PARTS).amin(dim=2)
+        c = self.clearance(x)
+        on_the_way = self.clearance(torch.cat([between, x[:, -1:]], dim=1)).unfold(1, PARTS + 1, PARTS).amin(dim=2)
+        # A clearance of steps between waypoints, such as a speed's, is larger of smaller steps.
+        return torch.minimum(on_the_way, torch.minimum(c[:, :-1], c[:, 1:]))
 
     def barrier(self, x: Tensor) -> Tensor:
         """C(x), (batch,): about 0 where feasible, negative where not."""
@@ -192,7 +195,7 @@ class Avoidance(Constraint):
     Args:
         robots: places the body points.
         incidence: A, (pairs, bodies).
-        offset: b, (pairs, 2 or 3).
+        offset: b, (pairs, 2 or 3), or (pairs, 1) where it is 0.
         radius: r, float64 (pairs,): the distance at which a pair touches.
     """
 
@@ -264,7 +267,7 @@ class RobotAvoidance(Avoidance):
         i, j = torch.triu_indices(len(robots.owner), len(robots.owner), 1)
         others = robots.owner[i] != robots.owner[j]
         i, j, bodies = i[others], j[others], torch.eye(len(robots.owner))
-        super().__init__(robots, bodies[i] - bodies[j], torch.zeros(len(i), 2), robots.radii[i] + robots.radii[j])
+        super().__init__(robots, bodies[i] - bodies[j], torch.zeros(len(i), 1), robots.radii[i] + robots.radii[j])
 
 
 class ObstacleAvoidance(Avoidance):

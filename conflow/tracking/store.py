@@ -50,8 +50,12 @@ def place() -> str:
 
 
 def exists() -> bool:
-    """Whether there is a store, of which to ask something: a question does not make one."""
-    return store_uri() != local_uri() or (RUNS / "mlflow.db").exists()
+    """Whether there is a store, of which to ask something: a question does not make one.
+
+    What stands in its place and cannot be used counts too: asking it says why.
+    """
+    blocked = RUNS.exists() and not RUNS.is_dir()
+    return store_uri() != local_uri() or (RUNS / "mlflow.db").exists() or blocked
 
 
 def client() -> MlflowClient:

@@ -3,6 +3,7 @@
 import hashlib
 import importlib.util
 import inspect
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -55,17 +56,14 @@ def task_of_file(path: Path) -> Task:
     """
     if not path.is_file():
         raise ConfigError(f"task={brief(path)}: no such file, expected a Python file that defines a Task")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(f"conflow_task_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # where dataclasses look for it
     try:
         spec.loader.exec_module(module)
-        found = [
-            kind
-            for kind in vars(module).values()
-            if isinstance(kind, type) and issubclass(kind, Task) and kind.__module__ == path.stem
-        ]
+        kinds = {id(kind): kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, Task)}
+        found = [kind for kind in kinds.values() if kind.__module__ == spec.name]
         if len(found) != 1:
             names = ", ".join(kind.__name__ for kind in found) or "none"
             raise ConfigError(f"task={brief(path)}: expected one class that is a conflow.Task, found {names}")
@@ -74,7 +72,7 @@ def task_of_file(path: Path) -> Task:
         task: Task = found[0]()
     except ConfigError:
         raise
-    except Exception as error:  # somebody else's code may fail in any way
+    except (Exception, SystemExit) as error:  # somebody else's code may fail in any way, or end
         raise ConfigError(f"task={brief(path)}: {type(error).__name__}: {brief(error)}") from error
     return checked(task, brief(path))
 

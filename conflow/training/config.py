@@ -8,6 +8,7 @@ import functools
 import hashlib
 import math
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -227,7 +228,7 @@ def _built(cls: type, tree: Any, prefix: str = "") -> Any:
     hints = get_type_hints(cls)
     if not isinstance(tree, dict):
         raise ConfigError(f"{prefix.removesuffix('.') or 'settings'}={brief(tree)}: expected nested settings")
-    for key in tree:
+    for key in map(str, tree):
         if key not in hints:
             known = f"expected one of conf/base.yaml{nearest(prefix + key, list(_types()))}"
             raise ConfigError(f"{brief(prefix + key)}: no such setting, {known}")
@@ -239,7 +240,8 @@ def _built(cls: type, tree: Any, prefix: str = "") -> Any:
         if dataclasses.is_dataclass(kind):
             values[key] = _built(cast(type, kind), value, f"{prefix}{key}.")
             continue
-        values[key] = float(value) if kind in (float, float | None) and type(value) is int else value
+        whole = kind in (float, float | None) and type(value) is int and abs(value) <= sys.float_info.max
+        values[key] = float(value) if whole else value
         if not _fits(values[key], kind):
             raise ConfigError(f"{prefix}{key}={brief(value)}: expected {_describe(kind)}")
     return cls(**values)
@@ -250,7 +252,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if get_origin(kind) is Literal:
         return value in get_args(kind)
     if kind == list[float]:
-        return isinstance(value, list) and all(isinstance(one, int | float) for one in value)
+        return isinstance(value, list) and len(value) <= MOST_NUMBERS and all(type(one) in (int, float) for one in value)
     of_kind = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
     return of_kind and not _refers(value)
 

@@ -114,7 +114,7 @@ class DemonstrationData(LightningDataModule):
         if data.path is not None:
             origin, found = f"data.path={data.path}", demonstrations.load(data.path)
             demonstrations.check(found.x, origin)
-            task = task or build_task(self.config, *found.x.shape[1:])
+            task = task or self._task_of(found.x, origin)
             task.scale, task.seconds = found.scale, found.seconds
             task.offset = [*found.offset] * (task.robots.D // len(found.offset))
         else:
@@ -131,6 +131,13 @@ class DemonstrationData(LightningDataModule):
                 f"and the numbers of task {task.name}"
             )
         return origin, found, task
+
+    def _task_of(self, x: Tensor, origin: str) -> Task:
+        """The task that the config names, for trajectories x (N, T, D) of a file."""
+        try:
+            return build_task(self.config, *x.shape[1:])
+        except DemonstrationError as error:
+            raise DemonstrationError(f"{origin}: {error}") from None
 
     def _split(self, name: str) -> tuple[Split, Split, Split]:
         data = self.config.data

@@ -59,12 +59,12 @@ def train(
     """
     lightning.seed_everything(config.seed, verbose=False)
     data = DemonstrationData(config, task)
-    console.print(understood(data), highlight=False, soft_wrap=True)
     model = Training(fitted(config, data.train.feasible().x), data.task)
     model.fit(data.train.feasible().x)
     interrupted = resume.find(wanted) if wanted else None
     asked = experiment(config, data)
     checkpoint = _continued(interrupted, asked, config, console, any_code) if interrupted else None
+    console.print(understood(data), highlight=False, soft_wrap=True)
     with recording.start(asked, interrupted) as logger:
         run_id = str(logger.run_id)
         if config.source.fit:

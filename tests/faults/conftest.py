@@ -71,8 +71,9 @@ def finished_run(name: str, folder: Path) -> str:
     data = DemonstrationData(settings)
     torch.manual_seed(0)
     model = model_of(settings, data.T, data.D)
-    described = {"config": settings.tree(), "T": data.T, "D": data.D, "threads": 1}
-    torch.save({"conflow": described, "state_dict": model.state_dict()}, folder / MODEL_FILE)
+    checkpoint = {"state_dict": model.state_dict()}
+    model.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, folder / MODEL_FILE)
     client = store.client()
     experiment = client.get_experiment_by_name(store.EXPERIMENT)
     assert experiment is not None

@@ -200,7 +200,7 @@ def claiming(*shape: int) -> bytes:
 
 
 NUMERIC = "expected an .npz file with numeric arrays"
-SHAPE = "expected (N, T, D) with T >= 3 waypoints and D = 2 per robot, two robots or more"
+SHAPE = "expected (N, T, D) with"
 # What is in the file of demonstrations, and what is said of it.
 FILES: dict[str, tuple[bytes, str]] = {
     "truncated": (written(x=X)[:3000], NUMERIC),
@@ -214,15 +214,24 @@ FILES: dict[str, tuple[bytes, str]] = {
     "larger than memory": (claiming(10**9, 4096, 4), "expected arrays that fit into memory"),
     "larger than numbers": (claiming(2**40, 2**40, 4), "expected an"),
     "another key": (written(y=X), "expected an array named x of shape (N, T, D)"),
-    "nan": (written(x=spoiled(np.nan)), "1 trajectories hold NaN or infinity, the first is 3, expected finite numbers"),
-    "inf": (written(x=spoiled(-np.inf)), "1 trajectories hold NaN or infinity, the first is 3, expected finite"),
-    "outside": (written(x=spoiled(1.5)), "1 trajectories leave the workspace [-1, 1], the first is 3, expected"),
+    "nan": (
+        written(x=spoiled(np.nan)),
+        "1 trajectories hold NaN or infinity, the first is 3, expected finite numbers",
+    ),
+    "inf": (
+        written(x=spoiled(-np.inf)),
+        "1 trajectories hold NaN or infinity, the first is 3, expected finite",
+    ),
+    "outside": (
+        written(x=spoiled(1.5)),
+        "1 trajectories leave the workspace [-1, 1], the first is 3, found -0.4998 to 1.5",
+    ),
     "beyond float32": (written(x=X.astype(np.float64) * 1e300), "50 trajectories hold NaN or infinity"),
     "rank 0": (written(x=np.float32(1)), f"x has shape (), {SHAPE}"),
     "rank 2": (written(x=X[0]), f"x has shape (8, 4), {SHAPE}"),
     "rank 4": (written(x=X[None]), f"x has shape (1, 50, 8, 4), {SHAPE}"),
-    "odd D": (written(x=X[:, :, :3]), f"x has shape (50, 8, 3), {SHAPE}"),
-    "one robot": (written(x=X[:, :, :2]), f"x has shape (50, 8, 2), {SHAPE}"),
+    "odd D": (written(x=X[:, :, :3]), f"x has shape (N, 8, 3), {SHAPE}"),
+    "one robot": (written(x=X[:, :, :2]), f"x has shape (N, 8, 2), {SHAPE}"),
     "two waypoints": (written(x=X[:, :2]), f"x has shape (50, 2, 4), {SHAPE}"),
     "no trajectory": (written(x=X[:0]), "x is empty, expected at least one trajectory"),
     "one trajectory": (written(x=X[:1]), "no trajectory for training is feasible out of 1, expected D+ too"),
@@ -355,20 +364,23 @@ OPTIONS = [
     (("demonstrations", f"num={HUGE}"), f"...: {WHOLE}"),
     (("demonstrations", f"seed={'1' * 5000}"), f"...: {WHOLE}"),
     (("demonstrations", "num=²"), f"num=²: {WHOLE}"),
-    (("demonstrations", "sed=1"), "sed: no such option, expected kind, out, num, seed; did you mean seed?"),
+    (
+        ("demonstrations", "sed=1"),
+        "sed: no such option, expected task, from, out, num, seed, agents, seconds, T, fps, opposite",
+    ),
     (("demonstrations", "seed\n=x"), f"seed=x: {WHOLE}"),
     (("sample", "goal=0.8,0,-0.8,0"), "start: expected the robots' positions, found none"),
     (("sample", "start=a,b", "goal=0,0"), "start=a,b: expected numbers with commas between"),
     (("sample", "start=0,0", "goal=0,0"), "start=[0.0, 0.0]: found shape (2,), expected numbers of shape (4,)"),
     (("sample", "start=nan,0,0.8,0", "goal=0.8,0,-0.8,0"), "start=(nan, 0, 0.8, 0): expected finite numbers"),
     (("sample", "start=1e400,0,0.8,0", "goal=0.8,0,-0.8,0"), "start=(inf, 0, 0.8, 0): expected finite numbers"),
-    (("sample", "start=0,0,0,0", "goal=0.8,0,-0.8,0"), "start=(0, 0, 0, 0): in collision with another robot, expected"),
+    (("sample", "start=0,0,0,0", "goal=0.8,0,-0.8,0"), "start=(0, 0, 0, 0): violates robot by 0.3, expected"),
     (("sample", f"start={'0,' * 9999}0", "goal=0.8,0,-0.8,0"), "...: found shape (10000,), expected"),
     (("sample", *PAIR, "obstacle=0,0"), "obstacles[0]=[0.0, 0.0]: found shape (2,), expected"),
     (("sample", *PAIR, "obstacle=0,0.5,-1"), "obstacles[0]=(0, 0.5, -1): expected finite numbers and a radius above 0"),
     (("sample", *PAIR, "obstacle=0,1e39,1"), "obstacles[0]=(0, inf, 1): expected finite numbers"),
     (("sample", *PAIR, "num=0"), f"num=0: {WHOLE} of at least 1 and at most 1000000"),
-    (("sample", *PAIR, "guidance=booth"), "guidance=booth: expected one of none, robot, obstacle, both; did you mean"),
+    (("sample", *PAIR, "guidance=robbot"), "guidance=robbot: expected one of none, all, robot, obstacle; did you mean"),
     (
         ("sample", *PAIR, "run=cpg-s0"),
         "run=cpg-s0: no such finished run, expected latest, an id, NAME or PRESET/NAME; did",
@@ -383,12 +395,12 @@ OPTIONS = [
     (("evaluate", "seed=3 # ../../x"), f"seed=3 # ../../x: {WHOLE}"),
     (("compare", "format=xml"), "format=xml: expected one of table, markdown, csv, json"),
     (("compare", "preset=it's"), "preset=it's: expected one of long, paper, quick, smoke"),
-    (("compare", "preset=paper"), "preset=paper: no run at this preset has finished"),
+    (("compare", "preset=paper"), "preset=paper: no such run has finished in runs/mlflow.db"),
     (("compare", "train.lr=fast"), f"train.lr=fast: {FINITE}"),
     (("train", "preset=smoke", "code=some"), "code=some: expected same or any"),
     (("ablations", "preset=smoke", "code="), "code=: expected same or any"),
     (("figures", "run=nobody"), "run=nobody: no such finished run, expected"),
-    (("figures", "rnu=latest"), "rnu: no such option, expected run, split; did you mean run?"),
+    (("figures", "rnu=latest"), "rnu: no such option, expected run, split, task; did you mean run?"),
     *(
         ((of_runs, "split=train"), "split=train: expected val or test")
         for of_runs in ("evaluate", "compare", "figures")
@@ -582,8 +594,8 @@ REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({"via": [(10**400, (0, 0.5, 0, -0.5))]}, "via[0]: s=1000"),
     ({"via": [(True, (0, 0.5, 0, -0.5))]}, "via[0]: s=True, expected a number above 0 and below 1"),
     ({"via": [(0.5, (0, 0.5, 0))]}, "via[0]=(0, 0.5, 0): found shape (3,), expected numbers of shape (4,)"),
-    ({"guidance": ["robot"]}, "guidance=['robot']: expected one of none, robot, obstacle, both"),
-    ({"guidance": "ROBOT"}, "guidance=ROBOT: expected one of none, robot, obstacle, both"),
+    ({"guidance": ["robot"]}, "guidance=['robot']: expected one of none, all, robot, obstacle"),
+    ({"guidance": "ROBOT"}, "guidance=ROBOT: expected one of none, all, robot, obstacle"),
     ({"robot_weight": float("nan")}, "robot_weight=nan: expected a finite number of at least 0"),
     ({"robot_weight": "1"}, "robot_weight=1: expected a finite number"),
     ({"obstacle_weight": 10**400}, "...: expected a finite number of at least 0 and at most 1000000000"),

@@ -84,6 +84,7 @@ from conflow.tracking import recording
 from conflow.training import config
 from conflow.tracking import store
 from conflow.training.datamodule import DemonstrationData
+from conflow.training.train import experiment
 
 def wait():
     print("ready", flush=True)
@@ -96,7 +97,7 @@ run = client.create_run(client.get_experiment_by_name(store.EXPERIMENT).experime
 for seed in range(5):
     data = DemonstrationData(config.load([*sys.argv[2:], f"data.seed={seed}"]))
     wait()
-    recording._log_dataset(client, run.info.run_id, data)
+    recording._log_dataset(client, run.info.run_id, experiment(data.config, data))
 """
 
 

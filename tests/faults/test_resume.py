@@ -18,7 +18,7 @@ TRAIN = (
     *("train", "preset=smoke", "data.num=200", "train.max_steps=41", "train.val_every=10", "train.log_every=7"),
     *("train.batch_size=16", "sample.num=8", "sample.steps=3"),
 )
-STEP = ("conflow.training.module", "ConFlow.training_step")
+STEP = ("conflow.training.module", "Training.training_step")
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def whole(folder: Path) -> Run:
         killed_in(*STEP, call=6),
         killed_in(*STEP, call=26),
         killed_in("torch.optim", "AdamW.step", call=37),
-        killed_in("conflow.training.module", "ConFlow.validation_step", call=2),
-        killed_in("conflow.training.module", "ConFlow.sample", call=3),
+        killed_in("conflow.training.module", "Training.validation_step", call=2),
+        killed_in("conflow.training.module", "Training.sample", call=3),
         killed_in("os", "fsync", call=5),
         killed_in("pathlib", "Path.replace", call=2),
         killed_in("pathlib", "Path.replace", call=5),

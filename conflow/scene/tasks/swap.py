@@ -37,8 +37,8 @@ class Swap(Task):
     ) -> None:
         if D < 4 or D % 2:
             raise DemonstrationError(
-                f"task {self.name}: x has shape (N, {T}, {D}), expected (N, T, D) with D = 2 per robot, two robots or "
-                "more, which avoid each other; one robot alone can have a task of its own"
+                f"x has shape (N, {T}, {D}), expected (N, T, D) with D = 2 per robot, two robots or more, which avoid "
+                f"each other in task {self.name}; one robot alone can have a task of its own"
             )
         self.T, self.robots = T, Discs.of(D, radius / 2)
         self.judges = Discs.of(D, (judged_radius or radius) / 2)
