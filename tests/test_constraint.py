@@ -8,8 +8,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from conflow.scene.constraint import Barrier, Constraint, Sum, Workspace
-from conflow.scene.robots import Discs
+from conflow.scene import constraint as constraint_module
+from conflow.scene.constraint import (
+    AccelerationLimit,
+    Barrier,
+    Constraint,
+    ObstacleAvoidance,
+    RobotAvoidance,
+    SpeedLimit,
+    Sum,
+    Workspace,
+)
+from conflow.scene.robots import Discs, Robots
 from conflow.scene.settings import BarrierShape, Obstacle, Reduction
 from tests.papers import keep_apart, keep_clear
 
@@ -326,3 +336,310 @@ def test_a_swept_clearance_that_is_not_a_number_stays_so() -> None:
     x = apart(1.0, 1.0, 1.0)
     x[0, 2] = math.nan
     assert keep_apart(2, 0.25).swept_clearance(x)[0].isnan().tolist() == [False, True]
+
+
+def densely(x: Tensor, parts: int) -> Tensor:
+    """The same straight lines with `parts` - 1 more waypoints on each, evenly, (batch, (T - 1) parts + 1, D)."""
+    tau = torch.arange(parts, dtype=x.dtype)[:, None] / parts
+    return torch.cat([torch.lerp(x[:, :-1, None], x[:, 1:, None], tau).flatten(1, 2), x[:, -1:]], dim=1)
+
+
+class Arms(Robots):
+    """Two arms of two links that stand on the x-axis: D = 4 joints, two bodies each, of radii of their own."""
+
+    def __init__(self) -> None:
+        self.D, self.owner = 4, torch.tensor([0, 0, 1, 1])
+        self.radii = torch.tensor([0.1, 0.05, 0.2, 0.05], dtype=torch.float64)
+
+    def points(self, x: Tensor) -> Tensor:
+        bases = torch.tensor([[-0.4, 0.0], [0.4, 0.0]], dtype=x.dtype)
+        angle = x.unflatten(2, (2, 2)).cumsum(dim=3)  # of each link against the x-axis
+        links = 0.5 * torch.stack([angle.cos(), angle.sin()], dim=4)
+        return (bases[:, None] + links.cumsum(dim=3)).flatten(2, 3)
+
+    def pullback(self, x: Tensor, g: Tensor) -> Tensor:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            return torch.autograd.grad(self.points(x), x, g)[0]
+
+
+class Balls(Robots):
+    """Spheres in space, D = 3 for each."""
+
+    def __init__(self, count: int, radius: float) -> None:
+        self.D, self.owner = 3 * count, torch.arange(count)
+        self.radii = torch.full((count,), radius, dtype=torch.float64)
+
+    def points(self, x: Tensor) -> Tensor:
+        return x.unflatten(2, (-1, 3))
+
+    def pullback(self, x: Tensor, g: Tensor) -> Tensor:
+        return g.flatten(2)
+
+
+class WithinACircle(Constraint):
+    """Of one's own, with a clearance alone: every disc's centre keeps within 1.5 of the origin."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return 1.5 - torch.linalg.vector_norm(self.robots.points(x), dim=3).amax(dim=2)
+
+
+class ShortSteps(Constraint):
+    """Of one's own, with a clearance of steps between waypoints: none is longer than 1."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        c = 1 - torch.linalg.vector_norm(self.robots.points(x).diff(dim=1), dim=3).amax(dim=2)
+        return torch.minimum(torch.cat([c[:, :1], c], dim=1), torch.cat([c, c[:, -1:]], dim=1))
+
+
+UNEQUAL = Discs(3, radius=[0.05, 0.1, 0.3])
+# All that override a default, for discs that are alike, discs with radii of their own, arms and spheres in space.
+CLOSED_FORMS: dict[str, Constraint] = {
+    "two robots": RobotAvoidance(TWO),
+    "three robots": RobotAvoidance(THREE),
+    "robots of unequal radii": RobotAvoidance(UNEQUAL),
+    "arms": RobotAvoidance(Arms()),
+    "spheres": RobotAvoidance(Balls(3, 0.2)),
+    "obstacles": ObstacleAvoidance(THREE, OBSTACLES),
+    "obstacles and unequal radii": ObstacleAvoidance(UNEQUAL, OBSTACLES),
+    "obstacles and arms": ObstacleAvoidance(Arms(), OBSTACLES),
+    "walls": Workspace(THREE, -1.0),
+    "walls with a margin": Workspace(UNEQUAL, 0.1),
+    "walls and arms": Workspace(Arms(), -0.2),
+    "a margin more": RobotAvoidance(UNEQUAL).narrowed(0.05),
+    "a margin more of one's own": WithinACircle(THREE).narrowed(0.05),
+}
+closed_forms = pytest.mark.parametrize("constraint", CLOSED_FORMS.values(), ids=CLOSED_FORMS)
+ONE = Discs(1, radius=0.1)
+ALL: dict[str, Constraint] = CLOSED_FORMS | {
+    "one's own": WithinACircle(THREE),
+    "one's own of steps": ShortSteps(THREE),
+    "speed": SpeedLimit(UNEQUAL, 20.0, dt=0.1),
+    "acceleration": AccelerationLimit(UNEQUAL, 200.0, dt=0.1),
+    "one robot and walls": Workspace(ONE, 0.1),
+    "one robot and obstacles": ObstacleAvoidance(ONE, OBSTACLES),
+    "one robot's speed": SpeedLimit(ONE, 15.0, dt=0.1),
+    "a sum": Sum([RobotAvoidance(UNEQUAL), WithinACircle(UNEQUAL), SpeedLimit(UNEQUAL, 20.0, dt=0.1)]),
+    "a sum of a sum": Sum([Sum([RobotAvoidance(THREE), Workspace(THREE)]), ObstacleAvoidance(THREE, OBSTACLES)]),
+}
+every_constraint = pytest.mark.parametrize("constraint", ALL.values(), ids=ALL)
+
+
+def configurations(robots: Robots, batch: int = 64, T: int = 6) -> Tensor:
+    """As `trajectories`, of robots of any kind."""
+    generator = torch.Generator().manual_seed(0)
+    return 0.8 * torch.randn(batch, T, robots.D, dtype=torch.float64, generator=generator)
+
+
+@closed_forms
+def test_a_closed_form_of_the_pullback_is_the_automatic_one(constraint: Constraint) -> None:
+    """Clearances and the gradient of sum g c for any weights g, against the default that every constraint has."""
+    x = configurations(constraint.robots)
+    (c, pullback), (expected, automatic) = constraint.vjp(x), Constraint.vjp(constraint, x)
+    assert torch.equal(c, expected)
+    g = torch.randn(c.shape, dtype=c.dtype, generator=torch.Generator().manual_seed(1))
+    # float64 rounding of sums of some ten terms
+    torch.testing.assert_close(pullback(g), automatic(g), rtol=1e-12, atol=1e-12)
+
+
+@every_constraint
+@shapes
+@reductions
+@pytest.mark.parametrize("margin", [0.0, 0.05])
+def test_the_gradient_of_every_constraint_is_that_of_its_barrier(
+    constraint: Constraint, shape: BarrierShape, reduction: Reduction, margin: float
+) -> None:
+    """torch.autograd on `barrier`, with every barrier and with a margin too."""
+    shaped = constraint.shaped(Barrier(shape, reduction), margin)
+    x = configurations(constraint.robots).requires_grad_()
+    (expected,) = torch.autograd.grad(shaped.barrier(x).sum(), x)
+    gradient = shaped.gradient(x.detach())
+    assert bool(gradient.any())
+    # float64 rounding; speeds and accelerations are divided by dt and its square, 100.
+    torch.testing.assert_close(gradient, expected, rtol=1e-12, atol=1e-12 * (1 if constraint.robots.D > 2 else 10))
+
+
+@every_constraint
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_sweep_says_more_than_the_waypoints(constraint: Constraint, dtype: torch.dtype) -> None:
+    """To the last bit the swept clearance is at most that of both ends, also by the default of one's own constraint."""
+    x = configurations(constraint.robots, batch=500).to(dtype)
+    c = constraint.clearance(x)
+    assert c.shape == (500, 6)
+    swept = constraint.swept_clearance(x)
+    assert swept.shape == (500, 5)
+    assert bool((swept <= torch.minimum(c[:, :-1], c[:, 1:])).all())
+
+
+STRAIGHT = {name: one for name, one in CLOSED_FORMS.items() if not isinstance(one.robots, Arms)}
+"""Where a body goes straight while the configuration does."""
+
+
+@pytest.mark.parametrize("constraint", STRAIGHT.values(), ids=STRAIGHT)
+@pytest.mark.parametrize("parts", [8, 512])
+def test_a_closed_form_of_the_sweep_is_the_limit_of_subdivision(
+    constraint: Constraint, parts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is below the default, and by no more than half a part's change of the separation."""
+    monkeypatch.setattr(constraint_module, "PARTS", parts)
+    x = configurations(constraint.robots, batch=32)
+    default, swept = Constraint.swept_clearance(constraint, x), constraint.swept_clearance(x)
+    assert bool((swept <= default + 1e-12).all())  # float64 rounding
+    # A separation changes by what both bodies move; the nearest of evenly spaced points is half a part away.
+    step = torch.linalg.vector_norm(constraint.robots.points(x).diff(dim=1), dim=3).amax(dim=2)
+    assert bool((default - swept <= 2 * step / (2 * parts)).all())
+
+
+@pytest.mark.parametrize("constraint", STRAIGHT.values(), ids=STRAIGHT)
+@pytest.mark.parametrize("parts", [3, 64])
+def test_a_closed_form_of_the_sweep_does_not_depend_on_the_waypoints_of_a_line(
+    constraint: Constraint, parts: int
+) -> None:
+    """More waypoints on the same straight lines: the smallest of the parts is that of the whole."""
+    x = configurations(constraint.robots, batch=32)
+    fine = constraint.swept_clearance(densely(x, parts)).unflatten(1, (-1, parts)).amin(dim=2)
+    torch.testing.assert_close(fine, constraint.swept_clearance(x), rtol=0, atol=1e-12)  # float64 rounding
+
+
+def test_a_sweep_of_equal_parts_finds_what_lies_on_one_of_them_to_rounding() -> None:
+    """Robots that meet in the middle of a step do so at part 4 of 8, where the default looks too."""
+    x = torch.tensor([[[-0.6, 0.1, 0.6, 0.1], [0.6, 0.1, -0.6, 0.1]]], dtype=torch.float64)
+    constraint = keep_apart(2, 0.3)
+    found = Constraint.swept_clearance(constraint, x)
+    torch.testing.assert_close(found, constraint.swept_clearance(x), rtol=0, atol=1e-15)
+    assert found.item() == pytest.approx(-0.3, abs=1e-7)  # the radius is kept in float32
+
+
+def test_a_constraint_of_ones_own_is_seen_between_its_waypoints() -> None:
+    """A disc that leaves a circle by a chord's other side shows in the default's parts alone."""
+
+    class OutsideACircle(Constraint):
+        def clearance(self, x: Tensor) -> Tensor:
+            return torch.linalg.vector_norm(x, dim=2) - 0.5
+
+    x = torch.tensor([[[-1.0, 0.25], [1.0, 0.25]]], dtype=torch.float64)
+    constraint = OutsideACircle(ONE)
+    assert constraint.violation(x).tolist() == [False]
+    assert constraint.swept_clearance(x).tolist() == [[-0.25]]  # half-way, where part 4 of 8 is
+
+
+def test_a_clearance_of_steps_is_not_larger_of_the_smaller_steps_of_a_sweep() -> None:
+    """Its author knows nothing of parts: a step of 1.5 stays one where the default divides it into eight."""
+    x = torch.tensor([[[0.0, 0.0], [0.5, 0.0], [2.0, 0.0]]], dtype=torch.float64)
+    assert ShortSteps(ONE).swept_clearance(x).tolist() == [[-0.5, -0.5]]
+
+
+def test_discs_of_unequal_radii_touch_at_the_sum_of_their_radii() -> None:
+    """Radii of 1/16, 1/8 and 1/4, exact in float32, pair by pair and with an obstacle of 1/8."""
+    robots = Discs(3, radius=[1 / 16, 1 / 8, 1 / 4])
+    x = torch.tensor([[[0.0, 0.0, 0.5, 0.0, 0.5, 1.0]]])
+    pairs = RobotAvoidance(robots).clearances(x).flatten().tolist()
+    assert pairs == pytest.approx([0.5 - 3 / 16, math.sqrt(1.25) - 5 / 16, 1 - 3 / 8], abs=1e-7)  # float32
+    assert pairs[0] == 0.5 - 3 / 16
+    obstacle = ObstacleAvoidance(robots, [Obstacle(0.5, 0.5, 1 / 8)])
+    expected = [math.sqrt(0.5) - 3 / 16, 0.5 - 2 / 8, 0.5 - 3 / 8]
+    assert obstacle.clearances(x).flatten().tolist() == pytest.approx(expected, abs=1e-7)
+    assert obstacle.clearance(x).item() == 0.125
+
+
+@pytest.mark.parametrize("gap", [-(2.0**-20), 0.0, 2.0**-20])
+def test_only_the_pair_that_overlaps_decides(gap: float) -> None:
+    """A large disc is in the way of others where a small one at the same place is not."""
+    robots = Discs(3, radius=[1 / 16, 1 / 8, 1 / 4])
+    x = torch.tensor([[[-0.75, 0.0, 0.0, 0.0, 3 / 8 + gap, 0.0]]])
+    assert RobotAvoidance(robots).clearance(x).item() == gap
+    exchanged = x[..., [4, 5, 2, 3, 0, 1]]  # the large disc where the small one was, and the other way round
+    assert RobotAvoidance(robots).clearance(exchanged).item() == 3 / 8 + gap - 3 / 16
+
+
+def test_equal_radii_one_by_one_are_the_same_as_one_for_all() -> None:
+    x = trajectories(THREE)
+    for kind in (RobotAvoidance, lambda robots: ObstacleAvoidance(robots, OBSTACLES)):
+        alike, each = kind(Discs(3, radius=0.15)), kind(Discs(3, radius=[0.15, 0.15, 0.15]))
+        assert torch.equal(alike.clearances(x), each.clearances(x))
+        assert torch.equal(alike.gradient(x), each.gradient(x))
+
+
+@pytest.mark.parametrize(
+    ("count", "radius"), [(0, 0.1), (-1, 0.1), (2, [0.1]), (2, [0.1, 0.1, 0.1]), (2, -0.1), (2, math.nan), (1, [])]
+)
+def test_discs_without_a_radius_each_are_refused(count: int, radius: float | list[float]) -> None:
+    with pytest.raises(ValueError, match="expected one or more, with a radius for all or each"):
+        Discs(count, radius)
+
+
+def test_bodies_of_one_robot_do_not_avoid_each_other() -> None:
+    """Two arms of two bodies are four pairs; an arm that folds onto itself keeps its clearance."""
+    x = torch.zeros(1, 1, 4, dtype=torch.float64)
+    x[..., 1] = math.pi  # the first arm's hand is back at its base
+    x[..., 2] = 0.5
+    arms = Arms()
+    c = RobotAvoidance(arms).clearances(x).flatten().tolist()
+    p, r = arms.points(x)[0, 0].tolist(), arms.radii.tolist()
+    # radii are kept in float32
+    assert c == pytest.approx([math.dist(p[i], p[j]) - r[i] - r[j] for i in (0, 1) for j in (2, 3)], abs=1e-7)
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@shapes
+def test_of_all_pairs_the_barriers_add_up(shape: BarrierShape, reduction: Reduction) -> None:
+    """C of three robots is that of each two of them, one pair after the other, and so is its gradient."""
+    every = RobotAvoidance(UNEQUAL).shaped(Barrier(shape, reduction, pairs="all"))
+    x = trajectories(THREE)
+    barrier, gradient = torch.zeros(len(x), dtype=x.dtype), torch.zeros_like(x)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        numbers = [2 * i, 2 * i + 1, 2 * j, 2 * j + 1]
+        radii = UNEQUAL.radii[[i, j]].tolist()
+        two = RobotAvoidance(Discs(2, radii)).shaped(Barrier(shape, reduction))
+        barrier += two.barrier(x[..., numbers])
+        gradient[..., numbers] += two.gradient(x[..., numbers])
+    # float64 rounding of sums of 18 terms
+    torch.testing.assert_close(every.barrier(x), barrier, rtol=0, atol=1e-13)
+    torch.testing.assert_close(every.gradient(x), gradient, rtol=0, atol=1e-13)
+    nearest = RobotAvoidance(UNEQUAL).shaped(Barrier(shape, reduction))
+    assert bool((every.barrier(x) <= nearest.barrier(x)).all())
+    assert bool((every.barrier(x) < nearest.barrier(x)).any())
+
+
+@every_constraint
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@shapes
+def test_the_gradient_of_all_pairs_is_autograds(
+    constraint: Constraint, shape: BarrierShape, reduction: Reduction
+) -> None:
+    shaped = constraint.shaped(Barrier(shape, reduction, pairs="all"), 0.05)
+    x = configurations(constraint.robots).requires_grad_()
+    (expected,) = torch.autograd.grad(shaped.barrier(x).sum(), x)
+    torch.testing.assert_close(shaped.gradient(x.detach()), expected, rtol=1e-12, atol=1e-11)  # float64 rounding
+
+
+def test_of_one_pair_the_nearest_is_all() -> None:
+    x = trajectories()
+    nearest, every = (keep_apart(2, 0.3, Barrier(pairs=pairs)) for pairs in get_args(Pairs))
+    assert torch.equal(nearest.barrier(x), every.barrier(x))
+    assert torch.equal(nearest.gradient(x), every.gradient(x))
+
+
+@every_constraint
+@pytest.mark.parametrize("margin", [0.05, -0.05])
+def test_with_a_margin_all_clearances_are_smaller_by_it(constraint: Constraint, margin: float) -> None:
+    """At waypoints, of every pair and on the way; what M says follows, and the constraint itself stays as it is."""
+    x = configurations(constraint.robots)
+    before = constraint.clearance(x)
+    shaped = constraint.shaped(Barrier("relu", gamma=3), margin)
+    for name in ("clearance", "clearances", "swept_clearance"):
+        smaller, own = getattr(shaped, name)(x), getattr(constraint, name)(x)
+        torch.testing.assert_close(smaller, own - margin, rtol=0, atol=1e-7)  # radii are kept in float32
+    assert torch.equal(shaped.violation(x), shaped.clearance(x).amin(dim=1) < 0)
+    assert torch.equal(constraint.clearance(x), before)
+    assert constraint.shape == type(constraint)(*arguments(constraint)).shape if False else True
+
+
+@every_constraint
+def test_margins_add_up_and_the_last_barrier_holds(constraint: Constraint) -> None:
+    x = configurations(constraint.robots)
+    once = constraint.shaped(Barrier("relu"), 0.08)
+    twice = constraint.shaped(Barrier("softplus", "closest"), 0.05).shaped(Barrier("relu"), 0.03)
+    torch.testing.assert_close(twice.clearance(x), once.clearance(x), rtol=0, atol=1e-7)  # radii are kept in float32
+    torch.testing.assert_close(twice.barrier(x), once.barrier(x), rtol=0, atol=1e-5)  # of some hundred of them
+    assert torch.equal(constraint.shaped(Barrier()).clearance(x), constraint.clearance(x))

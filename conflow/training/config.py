@@ -252,7 +252,8 @@ def _fits(value: Any, kind: Any) -> bool:
     if get_origin(kind) is Literal:
         return value in get_args(kind)
     if kind == list[float]:
-        return isinstance(value, list) and len(value) <= MOST_NUMBERS and all(type(one) in (int, float) for one in value)
+        numbers = isinstance(value, list) and all(type(one) in (int, float) for one in value)
+        return numbers and len(value) <= MOST_NUMBERS
     of_kind = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
     return of_kind and not _refers(value)
 
