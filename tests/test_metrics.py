@@ -7,8 +7,9 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from conflow.scene.constraint import Sum
+from conflow.scene.constraint import SpeedLimit, Sum, Workspace
 from conflow.scene.measures import endpoint_error, path_length, peak_acceleration, smoothness, squared_acceleration
+from conflow.scene.robots import Discs
 from conflow.scene.settings import Obstacle
 from conflow.scene.tasks.swap import swap
 from conflow.training import metrics as metrics_module
@@ -39,12 +40,6 @@ def parallel(gap: float, T: int = 5) -> Tensor:
     x[0, :, 0] = x[0, :, 2] = torch.linspace(-0.5, 0.5, T)
     x[0, :, 3] = -gap
     return x
-
-
-@pytest.mark.parametrize(("count", "total"), [(0, 256), (4, 256), (13, 40), (256, 256), (1, 10_000)])
-def test_wilsons_interval_is_scipys(count: int, total: int) -> None:
-    oracle = stats.binomtest(count, total).proportion_ci(0.95, "wilson")
-    assert wilson(count, total) == pytest.approx((oracle.low, oracle.high), abs=1e-12)
 
 
 def test_the_quantile_interval_covers_the_quantile_as_often_as_it_says() -> None:
@@ -88,6 +83,35 @@ def test_a_crossing_between_two_waypoints_is_a_swept_collision_alone() -> None:
         metric.update(x)
     assert at.compute()["at_rate"] == 0
     assert swept.compute()["swept_rate"] == 1
+
+
+def test_the_obstacle_between_two_waypoints_is_a_swept_collision_alone() -> None:
+    """Under the names that the constraints have, each at waypoints and on the way."""
+    x = parallel(0.5, T=4)
+    x[0, :, 0] = x[0, :, 2] = torch.tensor([-0.9, -0.3, 0.3, 0.9])
+    x[0, :, 1] = 0.4  # past (0, 0.5) in the middle of a step
+    metrics = trajectory_metrics({"robot": ROBOTS, "object": OBSTACLE}, ROBOTS, None, ROBOTS)
+    metrics.update(x=x.repeat(2, 1, 1), x_1=x.repeat(2, 1, 1))
+    found = {key: value for key, value in metrics.compute().items() if "collision" in key}
+    names = [f"{one}_collision{swept}" for one in ("robot", "object") for swept in ("", "_swept")]
+    assert found.keys() == {f"{name}_{part}" for name in names for part in ("rate", "low", "high", "count")}
+    assert [found[f"{name}_count"] for name in names] == [0, 0, 0, 2]
+
+
+def test_one_robot_is_measured_as_two_are() -> None:
+    """Of a straight line at constant speed 1 in a world with walls and a limit that it keeps."""
+    one = Discs(1)
+    judged = {"walls": Workspace(one), "speed": SpeedLimit(one, 1.5, dt=0.25)}
+    kept = Sum([*judged.values()])
+    metrics = trajectory_metrics(judged, kept, None, kept)
+    x = parallel(0.0)[..., :2].repeat(3, 1, 1)
+    x[2, -1, 0] = 0.9  # too far in the last step
+    metrics.update(x=x, x_1=x)
+    found = metrics.compute()
+    assert [found[f"{name}_collision_count"] for name in judged] == [0, 1]
+    assert found["success_count"] == 2
+    assert found["path_length_median"] == pytest.approx(1)
+    assert found["smoothness_median"] == pytest.approx(0, abs=1e-7)
 
 
 def test_smoothness_of_constant_speed_is_zero_and_of_a_parabola_its_acceleration() -> None:

@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 
 from conflow.results.statistics import LEVEL, Score, Seed, difference, differs, holm, mean_interval, rate_interval
-from conflow.training.metrics import EnergyDistance, wilson
+from conflow.training.metrics import EnergyDistance, Z, quantile_interval, wilson
 
 REPETITIONS = 2000
 NOISE = 3 * math.sqrt(0.95 * 0.05 / REPETITIONS)
@@ -67,8 +67,28 @@ def test_the_interval_holds_the_rate_and_what_counting_alone_leaves_open(counts:
 
 
 def test_no_collision_in_any_seed_is_as_much_as_one_network_can_say() -> None:
-    assert rate_interval([0, 0, 0], [10_000] * 3) == wilson(0, 10_000)
-    assert rate_interval([500, 500], [500] * 2) == wilson(500, 500)
+    for totals in ([10_000] * 3, [9_000, 10_000, 11_000]):
+        assert rate_interval([0, 0, 0], totals) == pytest.approx(wilson(0, 10_000), rel=1e-12, abs=0)
+        assert rate_interval(totals, totals) == pytest.approx(wilson(10_000, 10_000), rel=1e-12, abs=0)
+
+
+@pytest.mark.parametrize(("count", "total"), [(4, 256), (13, 40), (1, 10_000), (255, 256)])
+def test_wilsons_ends_are_where_the_score_test_turns(count: int, total: int) -> None:
+    """|count / n - p| = z sqrt(p (1 - p) / n) at both ends p."""
+    low, high = wilson(count, total)
+    assert low < count / total < high
+    for p in (low, high):
+        assert abs(count / total - p) == pytest.approx(Z * math.sqrt(p * (1 - p) / total), rel=1e-9)
+
+
+@pytest.mark.parametrize("total", [20, 256, 500, 2048, 10_240])
+@pytest.mark.parametrize("q", [0.5, 0.95])
+def test_the_ranks_of_a_quantiles_interval_are_scipys_to_one(q: float, total: int) -> None:
+    """Of 0, 1, ..., which are their own ranks; SciPy has none above the 0.95-quantile of 20."""
+    exact = stats.quantile_test(np.arange(total), q=total * q, p=q).confidence_interval(0.95)
+    low, high = quantile_interval(torch.randperm(total, generator=torch.Generator().manual_seed(0)).double(), q)
+    assert abs(low - exact.low) <= 1
+    assert high == total - 1 if math.isnan(exact.high) else abs(high - exact.high) <= 1
 
 
 @pytest.mark.parametrize(("seeds", "total"), [(2, 2048), (3, 2048), (5, 10240)])
@@ -103,6 +123,24 @@ def test_seeds_in_common_are_compared_in_pairs_and_others_by_welchs_test() -> No
         assert welch is not None
         assert welch.p == pytest.approx(stats.ttest_ind(a, b, equal_var=False).pvalue)
         assert welch.pairs == 0
+
+
+@pytest.mark.parametrize(("a", "b"), [((24, 44, 67), (301, 280)), ((24, 25, 26), (30, 31)), ((0, 0), (9, 30, 3))])
+def test_welchs_test_with_the_spread_of_counting_is_scipys_from_these_spreads(
+    a: tuple[int, ...], b: tuple[int, ...]
+) -> None:
+    """The spread between seeds, that of counting where it is larger, and one of each."""
+    sides = [[Score.of_rate(count, 2048) for count in counts] for counts in (a, b)]
+    one: dict[Seed, Score] = {(seed, "a"): score for seed, score in enumerate(sides[0])}
+    found = difference(one, {(seed, "b"): score for seed, score in enumerate(sides[1])})
+    assert found is not None
+    moments = []
+    for side in sides:
+        theta = [score.value for score in side]
+        moments += [fmean(theta), max(float(np.std(theta, ddof=1)), math.sqrt(1 / (4 * 2048 + 2))), len(theta)]
+    oracle = stats.ttest_ind_from_stats(*moments, equal_var=False)
+    assert found.p == pytest.approx(float(oracle.pvalue), rel=1e-9)
+    assert abs(found.a - found.b) / found.error == pytest.approx(abs(float(oracle.statistic)))
 
 
 def test_without_a_second_seed_or_without_a_spread_there_is_no_test() -> None:

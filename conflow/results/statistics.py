@@ -47,11 +47,17 @@ def rate_interval(counts: Sequence[int], totals: Sequence[int]) -> tuple[float, 
 
     sin^2(mean theta -+ t s / sqrt k) of k seeds, with t of k - 1 degrees of freedom, and never less than Wilson's of
     all trajectories together. Where none or all are counted, seeds cannot show what they differ by: then it is
-    Wilson's of one network.
+    Wilson's of one network, whose other end is z^2 / (n + z^2) away from 0 or 1. Its n trajectories are the mean of the
+    seeds', which need not be whole as SciPy's must.
+
+    Args:
+        counts: how many trajectories of each seed it holds for, (k,).
+        totals: of how many, (k,).
     """
     k, count, total = len(counts), sum(counts), sum(totals)
     if count in (0, total):
-        return wilson(count / k, total / k)
+        reach = Z**2 / (total / k + Z**2)
+        return (0.0, reach) if count == 0 else (1 - reach, 1.0)
     scores = [Score.of_rate(*one) for one in zip(counts, totals, strict=True)]
     centre, half = fmean(score.value for score in scores), _quantile(k - 1) * _spread(scores) / math.sqrt(k)
     low, high = (math.sin(min(max(end, 0), math.pi / 2)) ** 2 for end in (centre - half, centre + half))
@@ -118,7 +124,8 @@ def difference(a: Mapping[Seed, Score], b: Mapping[Seed, Score]) -> Difference |
     """Of two methods by their seeds, or None where there are too few to have a spread.
 
     Those that both methods have are compared in pairs where there are `PAIRS` of them, otherwise all by Welch's test.
-    Neither takes a spread below that of counting alone.
+    Neither takes a spread below that of counting alone. SciPy's `ttest_ind_from_stats` has the same p for such spreads,
+    but keeps the standard error and the degrees of freedom to itself, which `Difference.visible` needs.
     """
     common = [seed for seed in a if seed in b]
     paired = len(common) >= PAIRS
@@ -138,7 +145,8 @@ def difference(a: Mapping[Seed, Score], b: Mapping[Seed, Score]) -> Difference |
 def holm(ps: Sequence[float]) -> list[float]:
     """Holm's corrected p of tests that are read together: the chance of one false rejection among them is at most it.
 
-    The i-th smallest of m is multiplied by m - i + 1, and none is smaller than the one before it.
+    The i-th smallest of m is multiplied by m - i + 1, and none is smaller than the one before it. SciPy has corrections
+    for the rate of false discoveries, but not this one.
     """
     corrected, last = [0.0] * len(ps), 0.0
     for rank, i in enumerate(sorted(range(len(ps)), key=lambda i: ps[i])):

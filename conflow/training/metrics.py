@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 
 import torch
+from scipy import stats
 from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.utilities import dim_zero_cat
@@ -34,21 +35,26 @@ PAIR_ROWS, PAIR_COLUMNS = 1000, 10_000
 """Distances held at a time: 80 MB, where all pairs of 10,000 trajectories would take 800 MB."""
 
 
-def wilson(count: float, total: float) -> tuple[float, float]:
-    """Wilson's score interval of a rate count / total.
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """Wilson's score interval of a rate count / total, 95 %: SciPy's.
 
-    (p + z^2/2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2/n), with p = count / total and n = total.
+    (p + z^2/2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2/n), with p = count / total and n = total. Where none
+    are counted the lower end is 0, where all are the upper one is 1.
     """
-    p, n = count / total, total
-    centre, spread = p + Z**2 / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
-    # At 0 and n the ends are 0 and 1, which rounding would miss.
-    low = 0.0 if count == 0 else (centre - spread) / (1 + Z**2 / n)
-    high = 1.0 if count == total else (centre + spread) / (1 + Z**2 / n)
-    return low, high
+    low, high = stats.binomtest(count, total).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def quantile_interval(values: Tensor, q: float) -> tuple[float, float]:
-    """Distribution-free interval of the q-quantile: order statistics at n q -+ z sqrt(n q (1 - q))."""
+    """Distribution-free 95 % interval of the q-quantile: order statistics at n q -+ z sqrt(n q (1 - q)).
+
+    Published runs have these. SciPy's `quantile_test` takes exact binomial ranks, at most one rank away, and has no
+    upper end where the sample is too small for one; here it is then the largest value.
+
+    Args:
+        values: a sample (n,), in any order.
+        q: in (0, 1).
+    """
     n = len(values)
     spread = Z * math.sqrt(n * q * (1 - q))
     ranks = torch.tensor([math.floor(n * q - spread), math.ceil(n * q + spread)]).clamp(0, n - 1)
