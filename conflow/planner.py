@@ -76,7 +76,11 @@ class Planner:
     def __init__(self, model: ConFlow) -> None:
         self.model = model.eval()
         self.scale = float(model.task.scale)
-        self.offset = torch.as_tensor(model.task.offset, dtype=torch.float32).expand(model.D)
+        try:
+            self.offset = torch.as_tensor(model.task.offset, dtype=torch.float32).expand(model.D)
+        except RuntimeError:
+            expected = f"expected a number, or {model.D}, one for each of a configuration"
+            raise PlanError(f"task {model.task.name}: offset={brief(model.task.offset)}: {expected}") from None
 
     @classmethod
     def load(cls, run: str | Path = "latest", task: Task | None = None) -> "Planner":
@@ -156,9 +160,10 @@ class Planner:
         discs = [self._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
         met = {name: self.model.judged[name] for name in self.model.task.constraints()}
         met |= {f"obstacles[{i}]": self._avoidance(disc) for i, disc in enumerate(discs)}
-        named = {"start": start, "goal": goal} | {f"via[{i}]": point for i, point in enumerate(points.values())}
-        for name, position in named.items():
-            self._refuse_violation(name, position, met)
+        self._refuse_violation("start", start, 0, met)
+        self._refuse_violation("goal", goal, -1, met)
+        for i, (waypoint, point) in enumerate(points.items()):
+            self._refuse_violation(f"via[{i}]", point, waypoint, met)
 
         y = torch.stack([start, *(point.expand_as(start) for point in points.values()), goal], dim=-2)
         y = y.reshape(-1, *y.shape[-2:])
@@ -169,8 +174,10 @@ class Planner:
             v = self._field(ends, guidance, discs, robot_weight, obstacle_weight)
             return integrate(v, x_0, sample.steps, sample.solver)
 
-        x = self._sample(arrive, y, (0, *points, -1), num, seed)
+        index = (0, *points, -1)
+        x = self._sample(arrive, self._inside(y), index, num, seed)
         plans = self._in_users_units(_ranked(x, Sum(list(met.values()))))
+        plans.x[:, :, index] = y[:, None]  # which on the way through workspace units may have lost a bit
         return plans if start.ndim == 2 else plans[0]
 
     def _in_users_units(self, plans: Plans) -> Plans:
@@ -181,8 +188,16 @@ class Planner:
         """Whether the user's units are those; then nothing is computed that could cost a bit."""
         return self.scale == 1 and not bool(self.offset.any())
 
+    def to_workspace(self, x: Tensor) -> Tensor:
+        """Configurations x (..., D) of the user's units in workspace units."""
+        return x if self._in_workspace_units() else (x - self.offset) / self.scale
+
+    def _inside(self, y: Tensor) -> Tensor:
+        """Configurations y (..., D) that were checked, in workspace units, and not a bit outside."""
+        return self.to_workspace(y).clamp(-1, 1)
+
     def _configurations(self, name: str, value: Numbers, batch: bool = True) -> Tensor:
-        """Configurations (D,), with `batch` also (B, D), in workspace units and inside the workspace."""
+        """Configurations (D,), with `batch` also (B, D), in the user's units and inside the workspace."""
         D = self.model.D
         expected = f"numbers of shape ({D},)" + f" or (B, {D})" * batch
         y = _numbers(name, value, expected)
@@ -198,7 +213,7 @@ class Planner:
         # Not a number is not inside either.
         outside = ~((y >= low) & (y <= high)).all(dim=-1)
         _refuse(name, y, outside, f"expected finite numbers in the workspace {where}")
-        return y if self._in_workspace_units() else ((y - self.offset) / self.scale).clamp(-1, 1)
+        return y
 
     def _disc(self, name: str, disc: Obstacle | Sequence[float]) -> Obstacle:
         """An obstacle in workspace units."""
@@ -210,16 +225,22 @@ class Planner:
         )
         return Obstacle(x, y, found.radius / self.scale)
 
-    def _refuse_violation(self, name: str, y: Tensor, met: Mapping[str, Constraint]) -> None:
-        """Refuse configurations y (D,) or (B, D) that violate something: no plan through them is feasible."""
-        shown = y if self._in_workspace_units() else self.scale * y + self.offset
+    def _refuse_violation(self, name: str, y: Tensor, waypoint: int, met: Mapping[str, Constraint]) -> None:
+        """Refuse configurations y (D,) or (B, D) that violate something at a waypoint: no plan with them is feasible.
+
+        A constraint may be on more than the one waypoint, such as on its speed. So they are refused where they violate
+        it with all others there too and with all others elsewhere.
+        """
+        still = self._inside(y).view(-1, 1, self.model.D).repeat(1, self.model.T, 1)
+        elsewhere = torch.where(still > 0, -1.0, 1.0)
+        elsewhere[:, waypoint] = still[:, waypoint]
         for what, constraint in met.items():
-            # As trajectories that stand still.
-            still = y.view(-1, 1, self.model.D).expand(-1, 3, -1)
-            clearance = constraint.clearance(still).amin(dim=1)
-            by = self.scale * -float(clearance.min())
-            who = _nearest_bodies(constraint, still) if float(clearance.min()) < 0 else ""
-            _refuse(name, shown, clearance.view(y.shape[:-1]) < 0, f"violates {what} by {by:.3g}{who}, expected not to")
+            clearance = constraint.clearance(still)[:, waypoint]
+            violates = (clearance < 0) & (constraint.clearance(elsewhere)[:, waypoint] < 0)
+            if bool(violates.any()):
+                first = int(violates.nonzero()[0])
+                by = f"{self.scale * -float(clearance[first]):.3g}{_who(constraint, still[first, None], waypoint)}"
+                _refuse(name, y, violates.view(y.shape[:-1]), f"violates {what} by {by}, expected not to")
 
     def _check_memory(self, num: int, pairs: int) -> None:
         """Refuse more plans than fit into memory: x_0, x_1, what is missing of y, and the result."""
@@ -238,11 +259,11 @@ class Planner:
     ) -> Field:
         """The network's velocity field inside those of the guidance."""
         kept = [*self.model.task.constraints()]
-        known = [NONE, ALL, *kept, AROUND_OBSTACLES]
+        known = [*dict.fromkeys([NONE, ALL, *kept, AROUND_OBSTACLES])]
         if guidance is not None and guidance not in known:
             offer = nearest(str(guidance), known)
             raise PlanError(f"guidance={brief(guidance)}: expected one of {', '.join(known)}{offer}")
-        if guidance == AROUND_OBSTACLES and not obstacles:
+        if guidance == AROUND_OBSTACLES and guidance not in kept and not obstacles:
             raise PlanError("guidance=obstacle: expected obstacles to guide around, found none")
         sample = self.model.config.sample
         lambda_r = _weight("robot_weight", robot_weight, sample.robot_weight)
@@ -353,12 +374,13 @@ def _refuse(name: str, y: Tensor, refused: Tensor, reason: str) -> None:
         raise PlanError(f"{place}={_text(y.view(-1, y.shape[-1])[row].tolist())}: {reason}")
 
 
-def _nearest_bodies(constraint: Constraint, still: Tensor) -> str:
-    """Which robots violate a constraint most, of those that it pushes there; nothing where that says nothing."""
-    worst = still[int(constraint.clearance(still).amin(dim=1).argmin())][None]
-    robots = constraint.robots
-    pushed = robots.moved(constraint.gradient(worst)).any(dim=1)[0]
-    named = sorted({int(robot) + 1 for robot in robots.owner[pushed]})
+def _who(constraint: Constraint, x: Tensor, waypoint: int) -> str:
+    """Which robots of a trajectory (1, T, D) come so close at a waypoint; nothing where that cannot be said."""
+    robots, (c, pullback) = constraint.robots, constraint.vjp(x)
+    smallest = torch.zeros_like(c)
+    smallest[0, waypoint, c[0, waypoint].argmin()] = 1
+    moved = robots.moved(pullback(smallest))[0, waypoint]
+    named = sorted({int(robot) + 1 for robot in robots.owner[moved]})
     if robots.count == 1 or len(named) not in (1, 2):
         return ""
     return f" at robot {named[0]}" if len(named) == 1 else f" between robots {named[0]} and {named[1]}"

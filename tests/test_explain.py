@@ -217,7 +217,7 @@ def test_lambda_keeps_its_meaning_with_row_sums_alone(settings: Config) -> None:
     few, many, long = (clearing_times(settings, *at) for at in ((16, 0.4), (64, 0.4), (32, 1.6)))
     assert many[explanation.ROW_SUM] == pytest.approx(few[explanation.ROW_SUM], rel=0.1)
     assert long[explanation.ROW_SUM] == pytest.approx(few[explanation.ROW_SUM], rel=0.15)
-    for name in (explanation.PEAKED, explanation.SIGMA, explanation.FILTERED):
+    for name in (explanation.PEAKED, explanation.SIGMA, explanation.FILTER):
         assert few[name] > 1.5 * many[name]
     assert long[explanation.SIGMA] > 50 * few[explanation.SIGMA]
 
@@ -227,7 +227,7 @@ def test_lambda_keeps_its_meaning_with_row_sums_alone(settings: Config) -> None:
     for name, S in (
         (explanation.PEAKED, Sigma / Sigma.max()),
         (explanation.SIGMA, Sigma),
-        (explanation.FILTERED, gaussian_filter(32)),
+        (explanation.FILTER, gaussian_filter(32)),
     ):
         step = long[name] / 50
         assert clearing_time(Correction(constraint, S), x, step) == pytest.approx(long[name], rel=0.05)

@@ -3,22 +3,29 @@
 import json
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.text import Text
 from mlflow.entities import Run
 from rich.console import Console
 from torch import Tensor
 
 from conflow.figures import curves, gallery, workspace
-from conflow.figures.animation import animation, frames
+from conflow.figures.animation import animation, frames, gaps
 from conflow.flow.sampler import integrate
+from conflow.scene.constraint import Constraint, ObstacleAvoidance, RobotAvoidance, SpeedLimit, Sum
 from conflow.scene.measures import smoothness
+from conflow.scene.robots import Discs
+from conflow.scene.settings import Obstacle
+from conflow.scene.task import Task
 from conflow.tracking import recording, store
 from conflow.training import config
 from conflow.training.datamodule import DemonstrationData
@@ -177,6 +184,191 @@ def test_what_counts_as_touching_is_drawn_where_samples_are_judged(
     content = json.loads(animation(flow, evaluation, "").split("const content = ")[1].split(";\n")[0])
     # The obstacle is met by the discs that its guidance knows.
     assert [panel["radii"] for panel in content["scenes"][0]["panels"]] == [[0.1, 0.1], [0.1, 0.1], [0.15, 0.15]]
+
+
+class Hall(Task):
+    """Robots that go straight through a hall, at a limited speed, and at inference around two pillars."""
+
+    T = 12
+    PILLARS = [(0.0, 0.3, 0.1), (0.2, -0.4, 0.15)]  # noqa: RUF012
+
+    def __init__(self, count: int = 3) -> None:
+        self.robots = Discs(count, [0.05 + 0.02 * i for i in range(count)])
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"robot": RobotAvoidance(self.robots), "speed": SpeedLimit(self.robots, 2.2, self.dt)}
+
+    def constraints_at_inference(self) -> dict[str, Constraint]:
+        return {"pillars": ObstacleAvoidance(self.robots, [Obstacle(*pillar) for pillar in self.PILLARS])}
+
+    def obstacles(self) -> list[tuple[float, float, float]]:
+        return self.PILLARS
+
+    def demonstrations(self, num: int, seed: int) -> Tensor:
+        noise = torch.Generator().manual_seed(seed)
+        p, q = (0.9 * (2 * torch.rand(num, 1, self.robots.D, generator=noise) - 1) for _ in range(2))
+        return torch.lerp(p, q, torch.linspace(0, 1, self.T)[:, None])
+
+
+class Post(Hall):
+    """One robot and a post that is always there."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"post": ObstacleAvoidance(self.robots, [Obstacle(*self.PILLARS[1])])}
+
+    def constraints_at_inference(self) -> dict[str, Constraint]:
+        return {}
+
+    def obstacles(self) -> list[tuple[float, float, float]]:
+        return self.PILLARS[1:]
+
+
+class Sampled(NamedTuple):
+    """An untrained model of a task, its demonstrations, and what it makes."""
+
+    model: ConFlow
+    data: DemonstrationData
+    evaluation: Evaluation
+
+
+def sampled(task: Task) -> Sampled:
+    torch.manual_seed(0)
+    settings = config.load(["preset=smoke", "source.kind=cgp"])
+    flow, data = ConFlow(settings, task), DemonstrationData(settings, task)
+    return Sampled(flow, data, gallery.sample(flow, cycle(data.test.x, 40)))
+
+
+def circles(axis: Axes) -> list[tuple[float, ...]]:
+    shown = [patch for patch in axis.patches if isinstance(patch, Circle)]
+    return [(*circle.center, circle.radius) for circle in shown]
+
+
+def test_several_constraints_mark_a_collision_amid_the_bodies_that_come_so_close() -> None:
+    """Neither where the fastest robot is, nor amid all of which some barrier pushes."""
+    task = Hall()
+    x = torch.tensor([-0.9, 0.9, 0.3, 0.0, -0.3, 0.0]).repeat(3, 5, 1)
+    x[0, :, 2:] = torch.tensor([0.5, 0.2, 0.5, 0.3])  # too near all the time, while the first goes somewhere
+    x[0, :, 0] = torch.linspace(-0.9, -0.5, 5)
+    x[1, :, 4:] = torch.tensor([0.3, 0.0])  # in one place all the time
+    x[2, 1:, 0] = 0.9  # far too fast, between the first two waypoints
+    trained = Sum(list(task.constraints().values()))
+    found = workspace._contacts(x, trained)
+    torch.testing.assert_close(found[:2], torch.tensor([[0.5, 0.25], [0.3, 0.0]]))
+    assert found[2].abs().tolist() == pytest.approx([0.9, 0.9]), "where the fast one was, or where it is then"
+
+
+def test_obstacles_are_drawn_where_they_are_there() -> None:
+    """A post of the training is in every panel; pillars that appear at inference in their own alone."""
+    always, appearing = sampled(Post()), sampled(Hall())
+    post = [pytest.approx((0.2, -0.4, 0.15)), pytest.approx((0.2, -0.4, 0.2))]
+    flow, data, evaluation = always
+    for figure in (
+        workspace.demonstrations(data),
+        workspace.sources(flow, evaluation),
+        workspace.flow(flow, evaluation.source_samples),
+        workspace.methods([("one", flow, evaluation)]),
+    ):
+        assert all(circles(axis) == post for axis in figure.axes)
+    *spaces, curves_ = workspace.page(flow, data, evaluation, "test").axes
+    assert [axis.get_title().split("\n")[0] for axis in spaces[2:]] == ["generated, no guidance", "guided around post"]
+    assert all(circles(axis) == post for axis in spaces)
+    assert circles(curves_) == []
+    flow, data, evaluation = appearing
+    axes = {axis.get_title().split("\n")[0]: axis for axis in workspace.page(flow, data, evaluation, "test").axes}
+    pillars = circles(axes.pop("guided around pillars"))
+    assert [radius for *_, radius in pillars] == pytest.approx([0.1, 0.1 + 0.09, 0.15, 0.15 + 0.09])
+    assert not any(circles(axis) for axis in axes.values())
+
+
+def test_the_animation_shows_a_post_of_the_training_in_every_panel() -> None:
+    for task, there in ((Post(), [True, True]), (Hall(), [False, False, True])):
+        flow, _, evaluation = sampled(task)
+        content = json.loads(animation(flow, evaluation, "").split("const content = ")[1].split(";\n")[0])
+        assert content["obstacles"] == [list(disc) for disc in task.obstacles()]
+        assert content["owner"] == list(range(task.robots.count))
+        for scene in content["scenes"]:
+            assert [panel["obstaclesThere"] for panel in scene["panels"]] == there
+            measured = [panel["obstacleGap"] is not None for panel in scene["panels"]]
+            assert measured == [False, False, True][: len(there)]
+            for panel in scene["panels"]:
+                assert panel["radii"] == pytest.approx(task.robots.radii.tolist())
+
+
+def test_the_gap_of_a_frame_takes_no_frame_for_a_waypoint() -> None:
+    """As fast as between its waypoints a robot is between their frames too."""
+    task = Hall(1)
+    x = torch.zeros(1, 12, 2)
+    x[0, :, 0] = torch.linspace(-0.9, 0.9, 12)
+    speed, pillars = SpeedLimit(task.robots, 1.5, task.dt), task.constraints_at_inference()["pillars"]
+    assert float(speed.clearance(x)[0, 0]) == pytest.approx(-0.3, abs=1e-5)
+    assert gaps(speed, x)[0].numpy() == pytest.approx(np.full(frames(x).shape[1], -0.3), abs=1e-5)
+    torch.testing.assert_close(gaps(pillars, x), pillars.clearance(frames(x)))
+    both = Sum([speed, pillars])
+    torch.testing.assert_close(gaps(both, x), torch.minimum(gaps(speed, x), gaps(pillars, x)))
+
+
+def test_a_run_of_fewer_settings_leaves_no_empty_panel_behind() -> None:
+    runs = [("several", *sampled(Hall())[::2]), ("few", *sampled(Post())[::2])]
+    figure = workspace.methods(runs)
+    assert len(figure.axes) == 5
+    assert all(axis.get_title() for axis in figure.axes)
+
+
+def written_outside(figure: Figure) -> list[str]:
+    """Texts and legends that reach out of the picture."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    found = []
+    for legend in [*figure.legends, *(axis.get_legend() for axis in figure.axes if axis.get_legend())]:
+        assert legend is not None
+        found += [(text.get_text(), text.get_window_extent()) for text in legend.get_texts()]
+    for axis in figure.axes:
+        found += [
+            (text.get_text(), text.get_window_extent()) for text in (axis.title, axis.xaxis.label, axis.yaxis.label)
+        ]
+    found += [(text.get_text(), text.get_window_extent()) for text in figure.findobj(Text) if text is figure._suptitle]  # type: ignore[attr-defined]
+    box = figure.bbox
+    return [
+        text
+        for text, extent in found
+        if text and not (box.x0 <= extent.x0 and extent.x1 <= box.x1 and box.y0 <= extent.y0 and extent.y1 <= box.y1)
+    ]
+
+
+@pytest.mark.parametrize("task", [Post(), Hall(2), Hall(3), Hall(5)], ids=["1", "2", "3", "5"])
+def test_nothing_is_written_outside_a_picture(task: Task) -> None:
+    """However many robots there are, and settings, and constraints."""
+    flow, data, evaluation = sampled(task)
+    x_0 = evaluation.source_samples
+    for figure in (
+        workspace.demonstrations(data),
+        workspace.sources(flow, evaluation),
+        workspace.page(flow, data, evaluation, "test"),
+        workspace.methods([("one", flow, evaluation), ("other", flow, evaluation)]),
+        workspace.clearances(flow, evaluation),
+        curves.guidance({setting: guidance(flow, setting, x_0) for setting in flow.settings}),
+        curves.guidance_weight(flow, x_0),
+        curves.solver_steps(flow, x_0),
+    ):
+        assert written_outside(figure) == []
+        names = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        if "robot 1" in names:
+            assert names[:-1] == [f"robot {i + 1}" for i in range(task.robots.count)]
+
+
+def test_the_guidance_of_a_task_of_its_own_has_a_panel_for_each_constraint() -> None:
+    flow, _, evaluation = sampled(Hall())
+    found = {setting: guidance(flow, setting, evaluation.source_samples) for setting in flow.settings}
+    _, drift, *barriers = curves.guidance(found).axes
+    assert [axis.get_title() for axis in barriers] == ["barrier: robot", "barrier: speed", "barrier: pillars"]
+    for axis, name in zip(barriers, ("robot", "speed", "pillars"), strict=True):
+        assert curve(axis, "around all")[1] == found["all"].barriers[name].tolist()
+    assert drift.get_ylim()[0] == 0
+    weights = curves.guidance_weight(flow, evaluation.source_samples).axes
+    assert [axis.get_ylabel() for axis in weights] == ["robot- or speed-collision rate", "pillars-collision rate"]
 
 
 def test_methods_gives_every_run_a_row(evaluation: Evaluation) -> None:

@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import conflow
+from conflow.training import config
+from tests.papers import model_of
 
 PACKAGE = Path(conflow.__file__).parent
 FILES = {
@@ -36,11 +39,12 @@ def imports(module: str) -> set[str]:
     return found
 
 
-def loaded(*arguments: str) -> set[str]:
-    """The modules that a fresh interpreter has imported when it has run `arguments`."""
+def loaded(*arguments: str, code: int = 0) -> set[str]:
+    """The modules that a fresh interpreter has imported when it has run `arguments` and ended with this code."""
     finished = subprocess.run(
-        [sys.executable, "-X", "importtime", *arguments], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-X", "importtime", *arguments], capture_output=True, text=True, timeout=60
     )
+    assert finished.returncode == code, finished.stderr
     return {line.rpartition("|")[2].strip() for line in finished.stderr.splitlines() if line.startswith("import time:")}
 
 
@@ -49,8 +53,8 @@ def test_imports_go_downwards_only(module: str) -> None:
     """A room knows itself and those below it; flow/ and scene/, at the bottom, and tracking/ know no other room."""
     training = {"errors", "flow", "scene", "tracking", "training"}
     results = {*training, "results"}
-    commands = {"commandline", "demonstrations", "sample", "api", "planner"}
-    everything = {*results, "figures", "grid", *commands}
+    figures = {*results, "figures"}
+    commands = {"commandline", "demonstrations", "sample"}
     below = {
         "errors": set(),
         "flow": {"flow"},
@@ -59,19 +63,19 @@ def test_imports_go_downwards_only(module: str) -> None:
         "training": training,
         "results": results,
         "planner": training,
-        # Among the pictures is one of plans.
-        "figures": {*results, "planner", "figures"},
-        "grid": {*results, "grid"},
-        "commandline": training,
-        "demonstrations": {*training, "commandline"},
-        "sample": {*training, "commandline", "planner", "figures"},
-        "api": {*results, "figures"},
-        "__main__": everything,
+        # Among the pictures is one of plans; nothing else there knows the planner.
+        "figures": {*figures, "planner"} if module == "conflow.figures.plans" else figures,
+        "grid": {*training, "grid"},
+        "commandline": {"errors", "training"},
+        "demonstrations": {"errors", "scene", "training", "commandline"},
+        "sample": {"errors", "scene", "training", "commandline", "planner", "figures"},
+        "api": figures,
+        "__main__": {*figures, "grid", *commands},
         # The package itself names what programs need, and imports it when they ask for it.
         "": {"api", "planner", "scene"},
     }
     ours = {part(name) for name in imports(module) if name.split(".")[0] == "conflow"} - {""}
-    assert ours <= below.get(part(module), set())
+    assert ours <= below[part(module)]
 
 
 @pytest.mark.parametrize(("room", "libraries"), [("flow", {"torch"}), ("scene", {"torch", "numpy"})])
@@ -98,3 +102,35 @@ def test_help_answers_without_torch_and_mlflow(arguments: list[str]) -> None:
     seen = loaded("-m", "conflow", *arguments)
     assert "argparse" in seen
     assert not {"torch", "lightning", "mlflow", "numpy"} & {name.split(".")[0] for name in seen}
+
+
+def test_a_mistyped_setting_is_answered_without_torch() -> None:
+    """In a fraction of a second, where torch and Lightning would take several."""
+    seen = loaded("-m", "conflow", "train", "ablatoin=cgp", code=2)
+    assert "omegaconf" in seen
+    assert not {"torch", "lightning", "mlflow", "numpy"} & {name.split(".")[0] for name in seen}
+
+
+TOOLS = {
+    *("lightning", "pytorch_lightning", "mlflow", "sqlalchemy", "omegaconf", "yaml", "scipy", "matplotlib"),
+    *("torchmetrics", "pandas", "rich"),
+}
+
+
+def test_the_planner_needs_torch_and_numpy_alone(tmp_path: Path) -> None:
+    """Also where it reads a model's file and plans: a robot's computer has none of the experiment's tools."""
+    assert not TOOLS & {name.split(".")[0] for name in loaded("-c", "import conflow.planner")}
+    flow = model_of(config.load(["preset=smoke"]))
+    checkpoint = {"state_dict": flow.state_dict()}
+    flow.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    program = """
+import sys
+import conflow
+planner = conflow.Planner.load(sys.argv[1])
+ends = (-0.8, 0, 0.8, 0), (0.8, 0, -0.8, 0)
+assert planner.plan(*ends, 3, obstacles=[(0, 0.5, 0.1)], via=[(0.5, (0, -0.4, 0, 0.1))]).x.shape == (3, 32, 4)
+"""
+    seen = {name.split(".")[0] for name in loaded("-c", program, str(tmp_path / "model.ckpt"))}
+    assert {"torch", "numpy"} <= seen
+    assert not TOOLS & seen

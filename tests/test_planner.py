@@ -4,20 +4,26 @@ import math
 import pickle
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Circle
 from torch import Tensor
 
 from conflow import __main__ as command_line
+from conflow.figures.plans import picture
 from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
 from conflow.planner import PlanError, Planner, Plans, _ranked, exact
+from conflow.scene.constraint import Constraint, ObstacleAvoidance, RobotAvoidance
+from conflow.scene.robots import Discs, Robots
 from conflow.scene.settings import Obstacle
+from conflow.scene.task import Task
 from conflow.scene.tasks.swap import swap
 from conflow.tracking import signals, store
 from conflow.training import config
@@ -247,6 +253,313 @@ def test_plans_are_a_function_of_the_request_and_the_seed() -> None:
     assert not torch.equal(first.x, flow.plan(START, GOAL, 8, [DISC], VIA, seed=1).x)
 
 
+METRES, ZERO = 10.0, (3.0, -2.0, 3.0, -2.0)
+
+
+def in_metres(x: Any) -> Tensor:
+    return METRES * torch.as_tensor(x, dtype=torch.float32) + torch.tensor(ZERO)
+
+
+def planner_in_metres(*arguments: str, still: bool = False) -> Planner:
+    """The same model as that of `planner`, of a task whose user counts in metres from elsewhere."""
+    model = planner(*arguments, still=still).model
+    model.task.scale, model.task.offset = METRES, ZERO
+    return Planner(model)
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_plans_in_the_users_units_are_those_of_the_workspace_brought_there(still: bool) -> None:
+    """Obstacles and via-points included; lengths are longer by the scale, and what is feasible stays so."""
+    pairs = swap(3)
+    starts, goals = pairs[:, 0], pairs[:, -1]
+    discs: list[Any] = [Obstacle(0.0, 0.5, 0.1), (0.55, -0.6, 0.05)]
+    via: Any = [(0.5, (0.4, 0.6, -0.1, -0.6)), VIA[1]]
+    expected = planner(still=still).plan(starts, goals, 20, discs, via)
+    via = [(s, in_metres(position)) for s, position in via]
+    found = planner_in_metres(still=still).plan(
+        in_metres(starts), in_metres(goals), 20, [Obstacle(3.0, 3.0, 1.0), (8.5, -8.0, 0.5)], via
+    )
+    # Float32 on the way there and back, in metres.
+    torch.testing.assert_close(found.x, in_metres(expected.x), rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.clearance, METRES * expected.clearance, rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.smoothness, METRES * expected.smoothness, rtol=0, atol=1e-4)
+    assert torch.equal(found.feasible, expected.feasible)
+
+
+def test_what_is_asked_for_in_the_users_units_is_met_to_the_last_bit() -> None:
+    pairs = swap(3)
+    starts, goals = in_metres(pairs[:, 0]), in_metres(pairs[:, -1])
+    middle = in_metres(VIA[0][1])
+    x = planner_in_metres().plan(starts, goals, 5, via=[(0.5, middle)]).x
+    assert torch.equal(x[:, :, 0], starts[:, None].expand(-1, 5, -1))
+    assert torch.equal(x[:, :, -1], goals[:, None].expand(-1, 5, -1))
+    assert torch.equal(x[:, :, 16], middle.expand(3, 5, -1))
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            {"start": (-7.5, -2, 11, -2)},
+            r"start=\(-7.5, -2, 11, -2\): expected finite numbers in the workspace "
+            r"\(-7, -12, -7, -12\) to \(13, 8, 13, 8\)$",
+        ),
+        ({"start": (3, -2, 5, -2)}, r"start=\(3, -2, 5, -2\): violates robot by 1 between robots 1 and 2, expected"),
+        ({"goal": (11, -2, -5, -2.1)}, None),
+        ({"obstacles": [(-5.0, -1.0, 1.0)]}, r"start=\(-5, -2, 11, -2\): violates obstacles\[0\] by 1.5 at robot 1,"),
+        ({"obstacles": [(-5.0, 0.6, 1.0)]}, None),
+        ({"via": [(0.5, (3, -2, 3, 9))]}, r"via\[0\]=\(3, -2, 3, 9\): expected finite numbers in the workspace \(-7"),
+    ],
+)
+def test_messages_are_in_the_users_units(changed: dict[str, Any], said: str | None) -> None:
+    request: dict[str, Any] = {"start": in_metres(START), "goal": in_metres(GOAL), "num": 2} | changed
+    if said is None:
+        assert planner_in_metres(still=True).plan(**request).x.shape == (2, T, D)
+        return
+    with pytest.raises(PlanError, match=said):
+        planner_in_metres(still=True).plan(**request)
+
+
+def test_one_offset_for_all_axes_makes_one_range() -> None:
+    model = planner().model
+    model.task.scale, model.task.offset = 5.0, 5.0
+    assert Planner(model).plan((0, 5, 10, 5), (10, 5, 0, 5), 2).x.shape == (2, T, D)
+    with pytest.raises(PlanError, match=r"expected finite numbers in the workspace \[0, 10\]$"):
+        Planner(model).plan((0, 5, 10.1, 5), (10, 5, 0, 5), 2)
+
+
+def test_an_offset_that_goes_with_no_configuration_is_refused_in_one_line() -> None:
+    model = planner().model
+    model.task.offset = (3.0, -2.0)
+    with pytest.raises(PlanError, match=r"task swap: offset=\(3.0, -2.0\): expected a number, or 4, one for each"):
+        Planner(model)
+
+
+class Post(Task):
+    """One robot and a post, in metres."""
+
+    T, scale = 16, METRES
+    offset: float | Sequence[float] = (3.0, -2.0)
+    robots: Robots = Discs(1, 0.05)
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"post": ObstacleAvoidance(self.robots, [Obstacle(0.0, 0.2, 0.1)])}
+
+    def obstacles(self) -> list[tuple[float, float, float]]:
+        return [(0.0, 0.2, 0.1)]
+
+    def demonstrations(self, num: int, seed: int) -> Tensor:
+        raise NotImplementedError
+
+
+def planner_of(task: Task) -> Planner:
+    torch.manual_seed(0)
+    model = ConFlow(config.load(["preset=smoke"]), task)
+    torch.nn.init.zeros_(model.v.outlet.weight)
+    torch.nn.init.zeros_(model.v.outlet.bias)
+    return Planner(model)
+
+
+def test_a_single_robot_plans_around_what_its_task_keeps() -> None:
+    """And is named by nothing but its constraint: there is no other."""
+    flow = planner_of(Post())
+    unguided, guided = (flow.plan((-6, -2), (12, -2), 100, guidance=name, robot_weight=3) for name in ("none", "post"))
+    assert guided.x.shape == (100, 16, 2)
+    assert guided.clearance.mean() > unguided.clearance.mean()
+    assert torch.equal(guided.x, flow.plan((-6, -2), (12, -2), 100, robot_weight=3).x)
+    x, tau = unguided.x, torch.linspace(0, 1, 200)[:, None]
+    between = torch.lerp(x[:, :-1, None], x[:, 1:, None], tau).flatten(1, 2)
+    gap = (between - torch.tensor([3.0, 0.0])).norm(dim=2).amin(dim=1) - 1.5
+    torch.testing.assert_close(unguided.clearance, gap, rtol=0, atol=1e-3)  # metres, at 200 moments a step
+    with pytest.raises(PlanError, match=r"start=\(3, -1\): violates post by 0.5, expected not to$"):
+        flow.plan((3, -1), (12, -2))
+    with pytest.raises(PlanError, match=r"guidance=robot: expected one of none, all, post, obstacle$"):
+        flow.plan((-6, -2), (12, -2), guidance="robot")
+
+
+class Trio(Task):
+    """Three robots of which each is larger than the one before."""
+
+    T = 16
+    robots = Discs(3, (0.05, 0.1, 0.2))
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"robot": RobotAvoidance(self.robots)}
+
+    def demonstrations(self, num: int, seed: int) -> Tensor:
+        raise NotImplementedError
+
+
+TRIO = (-0.8, 0, 0.8, 0, 0, 0.8), (0.8, 0, -0.8, 0, 0, -0.8)
+
+
+def test_of_three_robots_those_that_collide_are_named() -> None:
+    """In a batch, those of the first pair that is refused, though another is worse."""
+    flow = planner_of(Trio())
+    assert flow.plan(*TRIO, 3).x.shape == (3, 16, 6)
+    starts = [TRIO[0], (-0.8, 0, 0.8, 0, 0.8, 0.2), (0, 0, 0, 0.01, 0, 0.8), (0.3, 0, -0.3, 0, 0.4, 0)]
+    for start, said in zip(
+        starts[1:],
+        (
+            r"violates robot by 0.1 between robots 2 and 3",
+            r"by 0.14 between robots 1 and 2",
+            r"by 0.15 between robots 1 and 3",
+        ),
+        strict=True,
+    ):
+        with pytest.raises(PlanError, match=said):
+            flow.plan(start, TRIO[1], 3)
+    with pytest.raises(
+        PlanError, match=r"start\[1\]=\(-0.8, 0, 0.8, 0, 0.8, 0.2\): violates robot by 0.1 between .* 3,"
+    ):
+        flow.plan(starts, [TRIO[1]] * 4, 3)
+
+
+def test_a_refusal_names_the_robots_whatever_the_barrier_counts() -> None:
+    with pytest.raises(PlanError, match=r"violates robot by 0.1 between robots 1 and 2"):
+        planner("constraint.pairs=all").plan((0, 0, 0.2, 0), GOAL)
+
+
+class Passing(Constraint):
+    """A disc that passes through the workspace, and so is elsewhere at every waypoint."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        place = torch.stack([torch.linspace(-0.8, 0.8, 16), torch.zeros(16)], dim=1)
+        return (self.robots.points(x)[:, :, 0] - place).norm(dim=2) - 0.2
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        c = self.clearance(x)
+        return torch.minimum(c[:, :-1], c[:, 1:])
+
+
+class Hurry(Constraint):
+    """The robot never stands still."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        c = x.diff(dim=1).norm(dim=2) - 0.01
+        return torch.cat([c[:, :1], c], dim=1)
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        return self.clearance(x)[:, 1:]
+
+
+class Crossing(Post):
+    scale, offset = 1.0, 0.0
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"passing": Passing(self.robots), "hurry": Hurry(self.robots)}
+
+
+def test_what_is_asked_for_is_judged_at_its_own_waypoint_and_not_as_if_the_robot_stood_there() -> None:
+    """Where the disc will be later is free now, and who starts somewhere does not stay there."""
+    flow = planner_of(Crossing())
+    assert flow.plan((0.8, 0), (-0.8, 0), 2, via=[(0.1, (0.5, 0.0))]).x.shape == (2, 16, 2)
+    for start, goal, via, said in (
+        ((-0.7, 0), (-0.8, 0), [], r"start=\(-0.7, 0\): violates passing by 0.1, expected"),
+        ((0.8, 0), (0.8, 0), [], r"goal=\(0.8, 0\): violates passing by 0.2"),
+        ((0.8, 0), (-0.8, 0), [(0.8, (0.48, 0.0))], r"via\[0\]=\(0.48, 0\): violates passing by 0.2"),
+    ):
+        with pytest.raises(PlanError, match=said):
+            flow.plan(start, goal, 2, via=via)
+
+
+class Named(Post):
+    def constraints(self) -> dict[str, Constraint]:
+        return {"obstacle": super().constraints()["post"]}
+
+
+def test_a_constraint_may_be_called_as_the_obstacles_are() -> None:
+    """Then that name guides around both."""
+    flow = planner_of(Named())
+    plans = flow.plan((-6, -2), (12, -2), 9, guidance="obstacle")
+    assert torch.equal(plans.x, flow.plan((-6, -2), (12, -2), 9).x)
+    with pytest.raises(PlanError, match=r"guidance=post: expected one of none, all, obstacle$"):
+        flow.plan((-6, -2), (12, -2), 9, guidance="post")
+
+
+def circles(planner: Planner, plans: Plans, obstacles: list[tuple[float, float, float]]) -> list[tuple[float, ...]]:
+    """The discs that a picture of plans shows, (x, y, radius)."""
+    (axis,) = picture(planner, plans, obstacles).axes
+    shown = [patch for patch in axis.patches if isinstance(patch, Circle)]
+    return [(*map(float, circle.center), float(circle.radius)) for circle in shown]
+
+
+@pytest.mark.parametrize("robots", [1, 2, 3, 4, 7])
+def test_the_legend_of_plans_names_every_robot_inside_the_picture(robots: int) -> None:
+    ends: tuple[Any, Any] = (-6.0, -2.0), (12.0, -2.0)
+    if robots == 1:
+        flow = planner_of(Post())
+    else:
+        flow = Planner(model_of(config.load(["preset=smoke"]), T, 2 * robots))
+        angles = 2 * math.pi * torch.arange(robots) / robots
+        start = 0.9 * torch.stack([angles.cos(), angles.sin()], dim=1).flatten()
+        ends = start, -start
+    figure = picture(flow, flow.plan(*ends, 4))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert sorted(texts) == sorted([*(f"robot {i + 1}" for i in range(robots)), "not feasible", "goal"])
+    for part in (legend, *legend.get_texts(), *figure.axes):
+        box = part.get_tightbbox(canvas.renderer)
+        assert box is not None
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+    assert not legend.get_window_extent().overlaps(figure.axes[0].get_window_extent())
+
+
+def test_the_picture_of_plans_is_in_the_users_units() -> None:
+    flow = planner_in_metres(still=True)
+    plans = flow.plan(in_metres(START), in_metres(GOAL), 5)
+    (axis,) = picture(flow, plans, [(3.0, 3.0, 1.0)]).axes
+    assert axis.get_xlim() == pytest.approx((-7.5, 13.5))
+    assert axis.get_ylim() == pytest.approx((-12.5, 8.5))
+    best = [line.get_xydata() for line in axis.lines if line.get_linewidth() == 2.5]
+    for robot, path in enumerate(best):
+        assert np.asarray(path) == pytest.approx(plans.x[0, :, 2 * robot : 2 * robot + 2].numpy(), abs=1e-5)
+    assert circles(flow, plans, [(3.0, 3.0, 1.0)]) == [(3.0, 3.0, 1.0)], "the task's is not there when plans are made"
+
+
+def test_what_a_task_always_has_in_the_way_is_in_the_picture() -> None:
+    flow = planner_of(Post())
+    found = circles(flow, flow.plan((-6, -2), (12, -2), 2), [(6.0, -6.0, 0.5)])
+    assert [pytest.approx(disc) for disc in found] == [(6.0, -6.0, 0.5), (3.0, 0.0, 1.0)]
+
+
+class Pendulum(Robots):
+    """A joint with two bodies on its rod; a configuration is half its angle, and no position."""
+
+    D, radii, owner = 1, torch.tensor([0.05, 0.05], dtype=torch.float64), torch.tensor([0, 0])
+
+    def points(self, x: Tensor) -> Tensor:
+        direction = torch.stack([(2 * x[..., 0]).sin(), -(2 * x[..., 0]).cos()], dim=-1)
+        return torch.stack([direction / 3, 2 * direction / 3], dim=2)
+
+    def pullback(self, x: Tensor, g: Tensor) -> Tensor:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            return torch.autograd.grad(self.points(x), x, g)[0]
+
+
+class Swing(Post):
+    scale, offset = 2.0, 0.0
+    robots = Pendulum()
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"post": ObstacleAvoidance(self.robots, [Obstacle(0.6, 0.6, 0.1)])}
+
+
+def test_the_picture_of_plans_shows_bodies_where_configurations_put_them() -> None:
+    flow = planner_of(Swing())
+    plans = flow.plan((-1.0,), (1.0,), 3)
+    assert plans.x.shape == (3, 16, 1)
+    (axis,) = picture(flow, plans).axes
+    best = [np.asarray(line.get_xydata()) for line in axis.lines if line.get_linewidth() == 2.5]
+    angle = plans.x[0, :, 0].numpy()
+    for path, length in zip(best, (2 / 3, 4 / 3), strict=True):
+        assert path == pytest.approx(length * np.stack([np.sin(angle), -np.cos(angle)], axis=1), abs=1e-5)
+
+
 NAN, INF = float("nan"), float("inf")
 REQUEST: dict[str, Any] = {"start": START, "goal": GOAL, "num": 2}
 
@@ -441,6 +754,16 @@ def test_the_command_writes_plans_and_picture_and_says_how_many_are_feasible(
     )
 
 
+def test_the_command_takes_points_to_pass(conflow_sample: Run, tmp_path: Path) -> None:
+    code, out, err = conflow_sample(*PAIR, "num=9", "via=0.5,0.1,0.6,-0.1,-0.6", "via=0.26,-0.3,0.37,0.41,-0.32")
+    assert (code, err) == (0, "")
+    assert "of 9 plans are feasible" in out
+    expected = Planner.load(tmp_path / "model.ckpt").plan(START, GOAL, 9, via=VIA)
+    with np.load("plans.npz") as file:
+        assert np.array_equal(file["x"], expected.x.numpy())
+        assert np.array_equal(file["x"][:, 16], np.tile(np.array(VIA[0][1], np.float32), (9, 1)))
+
+
 @pytest.mark.parametrize("existing", ["plans.npz", "plans.png"])
 def test_the_command_never_overwrites(existing: str, conflow_sample: Run) -> None:
     Path(existing).write_text("precious")
@@ -461,6 +784,9 @@ def test_the_command_never_overwrites(existing: str, conflow_sample: Run) -> Non
         (("start=-0.8;0", "goal=0,0"), "start=-0.8;0: expected numbers with commas between, such as -0.8,0,0.8,0"),
         (("start=-0.8,0", "goal=0,0"), r"start=\[-0.8, 0.0\]: found shape \(2,\)"),
         ((*PAIR, "obstacle=0,0.5"), r"obstacles\[0\]=\[0.0, 0.5\]: found shape \(2,\), expected .*radius"),
+        ((*PAIR, "via=0.5"), r"via\[0\]=\[\]: found shape \(0,\), expected numbers of shape \(4,\)"),
+        ((*PAIR, "via=0.5,0,0,0,0.5", "via=1.5,0,0,0,0.5"), r"via\[1\]: s=1.5, expected a number above 0 and below 1"),
+        ((*PAIR, "via=half,0,0,0,0.5"), "via=half,0,0,0,0.5: expected numbers with commas between"),
         ((*PAIR, "num=0"), "num=0: expected a whole number of at least 1"),
         ((*PAIR, "seed=-1"), "seed=-1: expected a whole number of at least 0"),
         ((*PAIR, "guidance=robbot"), r"guidance=robbot: expected one of .*did you mean robot\?"),

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above, titled
+from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above, standing, titled
+from conflow.scene.constraint import Avoidance, Constraint, Sum, Workspace
 from conflow.training.build import joined
 from conflow.training.evaluation import Evaluation
 from conflow.training.model import NONE, ConFlow
@@ -52,19 +53,41 @@ def frames(x: Tensor) -> Tensor:
     return torch.cat([between, x[:, -1:]], dim=1)
 
 
+def gaps(constraint: Constraint, x: Tensor) -> Tensor:
+    """The clearance of trajectories (batch, T, D) at each of their frames, (batch, frames).
+
+    That of a constraint on motion, as on speed, goes straight between those at waypoints: it would take frames for
+    waypoints, and their distance for a step.
+    """
+    terms = constraint.terms if isinstance(constraint, Sum) else [constraint]
+    found = [
+        term.clearance(frames(x)) if _of_positions(term) else frames(term.clearance(x)[..., None])[..., 0]
+        for term in terms
+    ]
+    return torch.stack(found).amin(dim=0)
+
+
+def _of_positions(constraint: Constraint) -> bool:
+    """Whether a constraint is one on where bodies are; others say themselves what holds between waypoints."""
+    subdivides = type(constraint).swept_clearance is Constraint.swept_clearance
+    return subdivides or isinstance(constraint, Avoidance | Workspace)
+
+
 def _panel(model: ConFlow, x: Tensor, setting: str) -> dict[str, Any]:
-    """One trajectory (1, T, D): each frame's positions, the bodies' radii, and the gaps to what is met at 0."""
-    x = frames(x)
+    """One trajectory (1, T, D): each frame's positions, the bodies' radii, and the gaps to what is met at 0.
+
+    Obstacles are there in all panels, or, where they appear at inference, in those that guide around them.
+    """
     appearing = [model.judged[name] for name in model.u_c_at_inference]
     around = any(name in model.u_c_at_inference for name in model.guided_around(setting))
     robots = model.task.robots if around else model.trained.robots
     return {
         "title": titled(setting),
-        "aroundObstacle": around,
+        "obstaclesThere": around or bool(standing(model.task)),
         "radii": [round(radius, 4) for radius in robots.radii.tolist()],
-        "positions": _rounded(seen_from_above(robots, x)[0]),
-        "keptGap": _rounded(model.trained.clearance(x)[0]),
-        "obstacleGap": _rounded(joined(appearing).clearance(x)[0]) if appearing else None,
+        "positions": _rounded(seen_from_above(robots, frames(x))[0]),
+        "keptGap": _rounded(gaps(model.trained, x)[0]),
+        "obstacleGap": _rounded(gaps(joined(appearing), x)[0]) if around else None,
     }
 
 

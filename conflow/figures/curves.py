@@ -36,7 +36,7 @@ def guidance_weight(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> 
         # A config that does not guide is shown about the weight 1.
         weights = [factor * (configured or 1.0) for factor in FACTORS]
         counts = collisions_by_weight(model, setting, x_0, weights, ends)
-        name = f"{' or '.join(guided)}-collision rate"
+        name = f"{'- or '.join(guided)}-collision rate"
         rate(axis, weights, counts, len(x_0), COLOURS[i % len(COLOURS)], name)
         axis.set_xscale("symlog", linthresh=weights[1])
         axis.set_xticks(weights, [f"{weight:g}" for weight in weights])
@@ -154,6 +154,7 @@ def _drift(axis: Axes, settings: Mapping[str, GuidanceTrace]) -> None:
     axis.set_xticks([0, 1], ["start", "goal"])
     axis.set(title="drift against the unguided sample", ylabel="mean distance (workspace units)")
     axis.margins(y=0.35)  # room for the legend above the bars
+    axis.set_ylim(bottom=0)
     axis.legend(frameon=False, loc="upper left")
     axis.spines[["top", "right"]].set_visible(False)
 

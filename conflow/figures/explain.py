@@ -1,7 +1,6 @@
 """Why the corrections work or do not, in pictures. The numbers come from `training.explanation`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,27 +12,36 @@ from torch import Tensor
 
 from conflow.figures.curves import MARK, rate
 from conflow.figures.workspace import COLLISION, ROBOTS, save
-from conflow.flow.correction import Correction, covariant
 from conflow.flow.source import Source
 from conflow.results import paper
-from conflow.scene.constraint import Constraint
 from conflow.tracking import store
 from conflow.training import explanation
-from conflow.training.build import build_source, fitted
-from conflow.training.closed_form import Way, coordinates, expected, minimiser
 from conflow.training.config import Config
+from conflow.training.explanation import Ends, Gap, Shifts, Widths
 
 # Okabe and Ito's palette.
 FILTER, COVARIANT, PEAK, PLAIN = "#E69F00", "#0072B2", "#009E73", "#CC79A7"
 FEASIBLE, SOURCE = ROBOTS[1], "#000000"
 FEW = 0.01
 LAMBDAS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0)
-TIMES = 25
 HORIZONS = (16, 24, 32, 48, 64, 96, 128)
 LENGTH_SCALES = (0.1, 0.2, 0.4, 0.8, 1.6)
 SHAPES = 5
 WEIGHTS = (0.0, 0.5, 1.0, 2.5, 5.0, 10.0)
 PAPERS, PAPER_RATE = "filter, the paper's", paper.TABLE_1["cgp"][0]
+OF_CORRECTION = {
+    explanation.FILTER: (PAPERS, FILTER),
+    explanation.CLOSEST: ("filter, closest approach alone", PLAIN),
+    explanation.COVARIANT: ("covariant", COVARIANT),
+}
+"""Label and colour of each correction where trajectories flow."""
+LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
+    explanation.ROW_SUM: (r"$\Sigma$ / largest row sum (ours)", {"color": COVARIANT, "ls": "-", "marker": "o"}),
+    explanation.PEAKED: (r"$\Sigma$ / largest entry", {"color": PEAK, "ls": "--", "marker": "s"}),
+    explanation.SIGMA: (r"$\Sigma$", {"color": PLAIN, "ls": "-.", "marker": "^"}),
+    explanation.FILTER: ("Gaussian filter", {"color": FILTER, "ls": ":", "marker": "D"}),
+}
+"""Label and look of each matrix S whose clearing times are compared."""
 
 
 def draw(settings: Config, console: Console) -> None:
@@ -56,7 +64,7 @@ def draw(settings: Config, console: Console) -> None:
 
 def gap(settings: Config) -> Figure:
     """The gap between the robots when they pass, as a flow in one dimension, without and with the correction."""
-    problem, lambda_c = explanation.Gap.of(settings), settings.correction.lambda_c
+    problem, lambda_c = Gap.of(settings), settings.correction.lambda_c
     paths = {weight: problem.paths(weight) for weight in sorted({*LAMBDAS, lambda_c})}
     rates = {weight: problem.collision_rate(g[-1]) for weight, g in paths.items()}
     figure = Figure(figsize=(9.5, 7.4), layout="constrained")
@@ -79,91 +87,65 @@ def gap(settings: Config) -> Figure:
 
 def support(settings: Config) -> Figure:
     """The filtered and the covariant correction of D-, along s and in the source's own standard deviations."""
-    x = explanation.demonstrations(settings)
-    constraint, source = explanation.label(settings), build_source(settings.source, x.shape[1])
-    x = x[constraint.violation(x)].double()
-    # In float64 from end to end: in the trailing modes float32's rounding would be larger than what is to be seen.
-    g = constraint.gradient(x)
-    found = {"filter": explanation.filter_of(settings, x.shape[1]) @ g, "covariant": covariant(source.covariance) @ g}
+    shifts = Shifts.of(settings)
+    norms = shifts.norms()
     figure = Figure(figsize=(12, 4.4), layout="constrained")
-    along, modes, norms = figure.subplots(1, 3)
-    middling = constraint.clearance(x).amin(dim=1).median(dim=0).indices
-    _along(along, {r"$\nabla C$": g[middling, :, 1]} | {name: u[middling, :, 1] for name, u in found.items()})
-    _by_mode(modes, {name: explanation.in_deviations(source, u)[..., 1].abs() for name, u in found.items()})
-    away = {name: explanation.in_deviations(source, u).square().sum(dim=(1, 2)).sqrt() for name, u in found.items()}
-    _norms(norms, away)
+    along, modes, off = figure.subplots(1, 3)
+    _along(along, {r"$\nabla C$": shifts.gradient[:, 1]} | {name: u[:, 1] for name, u in shifts.along.items()})
+    _by_mode(modes, {name: z[..., 1].abs() for name, z in shifts.deviations.items()})
+    _norms(off, norms)
     figure.suptitle(
-        f"After one unit of t at λ = 1 the filter's bump lies {away['filter'].median():.0f} standard "
-        f"deviations of the source away, the covariant one {away['covariant'].median():.2f}"
+        f"After one unit of t at λ = 1 the filter's bump lies {norms[explanation.FILTER].median():.0f} standard "
+        f"deviations of the source away, the covariant one {norms[explanation.COVARIANT].median():.2f}"
     )
     return figure
 
 
 def exact(settings: Config) -> Figure:
     """What the paper's loss asks for: collisions after the flow of its exact minimiser, and how far x_t goes astray."""
-    # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
-    nominal = replace(settings, data=replace(settings.data, jitter=0))
-    x_1, lambda_c = explanation.demonstrations(nominal)[: explanation.PAIRS], nominal.correction.lambda_c
-    source, constraint = build_source(nominal.source, x_1.shape[1]), explanation.label(nominal)
-    nearest = replace(nominal, constraint=replace(nominal.constraint, reduction="closest"))
-    smoothing, M = explanation.filter_of(nominal, x_1.shape[1]), constraint.violation(x_1)
-    corrections = {
-        PAPERS: Correction(constraint, smoothing),
-        "filter, closest approach alone": Correction(explanation.label(nearest), smoothing),
-        "covariant": Correction(constraint, covariant(source.covariance)),
-    }
+    flows, demonstrated = explanation.exact_flows(settings, WEIGHTS)
+    lambda_c, samples = settings.correction.lambda_c, explanation.SAMPLES
     figure = Figure(figsize=(9.5, 4.2), layout="constrained")
     rates, astray = figure.subplots(1, 2)
-    counts: dict[tuple[str, float], int] = {}
-    for (name, u_c), colour in zip(corrections.items(), (FILTER, PLAIN, COVARIANT), strict=True):
-        for weight in sorted({*WEIGHTS, lambda_c}):
-            path = explanation.sampled(source, x_1, minimiser(source, x_1, M, u_c, weight))
-            counts[name, weight] = int(constraint.violation(path[-1]).sum())
-            if weight == lambda_c:
-                t = torch.arange(len(path)) / explanation.SAMPLE_STEPS
-                astray.plot(t, torch.stack([explanation.astray(source, x) for x in path]), color=colour, label=name)
-        own = {weight: count for (of, weight), count in counts.items() if of == name}
-        rate(rates, list(own), list(own.values()), explanation.SAMPLES, colour, name)
-    rates.axhline(float(M.float().mean()), color=COLLISION, ls="--", lw=1, label="demonstrations")
+    for correction, flow in flows.items():
+        label, colour = OF_CORRECTION[correction]
+        t = torch.arange(len(flow.astray)) / explanation.SAMPLE_STEPS
+        astray.plot(t, flow.astray, color=colour, label=label)
+        rate(rates, list(flow.collisions), list(flow.collisions.values()), samples, colour, label)
+    rates.axhline(demonstrated, color=COLLISION, ls="--", lw=1, label="demonstrations")
     rates.axhline(PAPER_RATE, color=MARK, ls=":", lw=1, label="the paper's reported rate")
     rates.set(xlabel=r"weight $\lambda_c$", ylabel="robot-collision rate")
     rates.set_ylim(top=1.6 * rates.get_ylim()[1])  # room for the legend
-    rates.set_title(f"{explanation.SAMPLES} samples of the exact flow\nband: 95 % Wilson")
+    rates.set_title(f"{samples} samples of the exact flow\nband: 95 % Wilson")
     astray.set(xlabel="flow time t", xlim=(0, 1), yscale="log", ylabel="root mean square, in standard deviations")
     astray.set_title(rf"$x_t$ beyond the first {explanation.kept()} modes, $\lambda_c = {lambda_c:g}$")
     for axis in (rates, astray):
         _finish(axis, fontsize="small")
     figure.suptitle(
-        f"The exact minimiser of the paper's loss collides in {counts[PAPERS, lambda_c]} of {explanation.SAMPLES} "
-        f"samples at λ = {lambda_c:g}:\nit brings back what the filter pushes astray, which a network has to learn"
+        f"The exact minimiser of the paper's loss collides in {flows[explanation.FILTER].collisions[lambda_c]} of "
+        f"{samples} samples at λ = {lambda_c:g}:\nit brings back what the filter pushes astray, which a network has to "
+        "learn"
     )
     return figure
 
 
 def eigenvalues(settings: Config) -> Figure:
     """How wide the source is in each of its modes, how wide the demonstrations are there, and the modes along s."""
-    x = explanation.demonstrations(settings)
-    x = x[~explanation.label(settings).violation(x)].double()
-    likely = fitted(replace(settings, source=replace(settings.source, fit=True)), x)
-    kept = explanation.kept()
+    kernels, kept = Widths.of(settings), explanation.kept()
+    lengths = [rf"$\ell = {kernel.length_scale:.2f}$" for kernel in kernels]
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     widths, shapes = figure.subplots(1, 2)
-    lengths, left_out = [], []
-    kernels = (settings.source, COVARIANT, "-", "the paper's"), (likely.source, FILTER, "--", "most likely for $D^+$")
-    for chosen, colour, style, name in kernels:
-        source = build_source(chosen, x.shape[1])
-        z = coordinates(source, x)
-        lengths.append(rf"$\ell = {chosen.length_scale:.2f}$")
-        left_out.append(float((source.modes[:, kept:] @ z[:, kept:]).abs().max()))
-        k, label = torch.arange(1, z.shape[1] + 1), f"source, {lengths[-1]}: {name}"
-        widths.plot(k, source.variance.sqrt(), color=colour, ls=style, marker="o", ms=4, label=label)
-        deviation = z.square().mean(dim=(0, 2)).sqrt()
-        widths.plot(k, deviation, color=colour, ls=":", marker="x", label=f"$D^+$ in its modes, {lengths[-1]}")
-        _shapes(shapes, source, style)
+    looks = (COVARIANT, "-", "the paper's"), (FILTER, "--", "most likely for $D^+$")
+    for kernel, length, (colour, style, name) in zip(kernels, lengths, looks, strict=True):
+        k, label = torch.arange(1, len(kernel.demonstrations) + 1), f"source, {length}: {name}"
+        widths.plot(k, kernel.source.variance.sqrt(), color=colour, ls=style, marker="o", ms=4, label=label)
+        label = f"$D^+$ in its modes, {length}"
+        widths.plot(k, kernel.demonstrations, color=colour, ls=":", marker="x", label=label)
+        _shapes(shapes, kernel.source, style)
     _widths(widths, settings.source.epsilon, kept)
     shapes.set_title(f"first modes along s: solid {lengths[0]}, dashed {lengths[1]}")
     figure.suptitle(
-        f"{kept} modes hold all of D+ to within {max(left_out):.0e} workspace units;\n"
+        f"{kept} modes hold all of D+ to within {max(kernel.left_out for kernel in kernels):.0e} workspace units;\n"
         "from there on the source is √ε wide and the demonstrations hold nothing more"
     )
     return figure
@@ -171,30 +153,15 @@ def eigenvalues(settings: Config) -> Figure:
 
 def predicted_end(settings: Config) -> Figure:
     """Who is in collision on the way, at x_t and at the end E[x_1 | x_t] that is expected from there."""
-    # Exact expectations need the same y for all: without jitter every demonstration has the nominal start and goal.
-    # Modes beyond those kept are as wide as their white part, and would tell x_1 long before the others do.
-    nominal = replace(
-        settings, data=replace(settings.data, jitter=0), source=replace(settings.source, modes=explanation.kept())
-    )
-    x = explanation.demonstrations(nominal)
-    constraint, source = explanation.label(nominal), build_source(nominal.source, x.shape[1])
-    violates = constraint.violation(x)
-    t = torch.arange(TIMES) / TIMES
-    feasible, every = (
-        [expected(source, x_1[: explanation.PAIRS], now) for now in t.tolist()] for x_1 in (x[~violates], x)
-    )
+    ends = Ends.of(settings)
+    t, at, end = ends.t, ends.at, ends.end
     figure = Figure(figsize=(12, 4.6), layout="constrained")
     shares, pushes, told = figure.subplots(1, 3)
-    at, end = (
-        torch.stack([constraint.violation(one).float().mean() for one in ways])
-        for ways in ([way.x_t for way in feasible], [way.end for way in feasible])
-    )
     shares.plot(t, at, color=FILTER, ls="--", label="at $x_t$")
     shares.plot(t, end, color=COVARIANT, label=r"at the predicted end $E[x_1 | x_t]$")
     shares.set(ylabel="share in collision", title="pairs with a feasible $x_1$, $D^+$", ylim=(0, 1.02))
-    u_c = Correction(constraint, covariant(source.covariance))
-    _pushes(pushes, t, feasible, x[~violates][: explanation.PAIRS], u_c)
-    _told(told, t, every, violates[: explanation.PAIRS], constraint)
+    _pushes(pushes, ends)
+    _told(told, ends)
     for axis in (shares, pushes, told):
         axis.set(xlabel="flow time t", xlim=(0, 1))
         _finish(axis, fontsize="small")
@@ -227,15 +194,7 @@ def lambda_scale(settings: Config) -> Figure:
     return figure
 
 
-LOOKS: dict[str, dict[str, Any]] = {
-    explanation.ROW_SUM: {"color": COVARIANT, "ls": "-", "marker": "o"},
-    explanation.PEAKED: {"color": PEAK, "ls": "--", "marker": "s"},
-    explanation.SIGMA: {"color": PLAIN, "ls": "-.", "marker": "^"},
-    explanation.FILTERED: {"color": FILTER, "ls": ":", "marker": "D"},
-}
-
-
-def _fields(axes: Sequence[Axes], problem: explanation.Gap, paths: Mapping[float, Tensor]) -> None:
+def _fields(axes: Sequence[Axes], problem: Gap, paths: Mapping[float, Tensor]) -> None:
     """The field over t and g in colour, a panel for each weight, with some paths through it."""
     t, g = torch.linspace(0, 1, explanation.GAP_STEPS + 1), torch.linspace(-2, 2, 201)
     v = {weight: problem.velocities(t[:-1], g, weight) for weight in paths}
@@ -252,7 +211,7 @@ def _fields(axes: Sequence[Axes], problem: explanation.Gap, paths: Mapping[float
     axes[0].figure.colorbar(image, ax=axes, label="dg/dt (workspace units per t)", extend="both")
 
 
-def _densities(axis: Axes, problem: explanation.Gap, ends: Mapping[float, Tensor]) -> None:
+def _densities(axis: Axes, problem: Gap, ends: Mapping[float, Tensor]) -> None:
     """The gaps of demonstrations and of where the flow ends, and the density of the source."""
     bins = torch.linspace(-2, 2, 81).tolist()
     share = torch.full_like(problem.g_1, 1 / (len(problem.g_1) * (bins[1] - bins[0])))
@@ -303,7 +262,7 @@ def _norms(axis: Axes, values: Mapping[str, Tensor]) -> None:
 
 
 def _widths(axis: Axes, epsilon: float, kept: int) -> None:
-    """Label the widths by mode, with the kernel's white part and the modes that are explanation.kept."""
+    """Label the widths by mode, with the kernel's white part and the modes that are kept."""
     floor = epsilon**0.5
     axis.axhline(floor, color=MARK, lw=0.8)
     axis.annotate(r"$\sqrt{\epsilon}$: the kernel's white part", (kept + 2, floor), (0, 4), "data", "offset points")
@@ -329,38 +288,27 @@ def _shapes(axis: Axes, source: Source, style: str) -> None:
     _finish(axis, ncols=SHAPES, loc="upper center", fontsize="small", columnspacing=1, handlelength=1)
 
 
-def _pushes(axis: Axes, t: Tensor, ways: Sequence[Way], x_1: Tensor, u_c: Correction) -> None:
+def _pushes(axis: Axes, ends: Ends) -> None:
     """The push on pairs that need none, at both places, without and with the weight t, and its integral over t."""
-    at = torch.stack([_size(u_c(way.x_t)) for way in ways])
-    end = torch.stack([_size(u_c(way.end)) for way in ways])
-    for push, colour, name in ((at, FILTER, "at $x_t$"), (end, COVARIANT, "at the end")):
+    t = ends.t
+    for push, colour, name in ((ends.push_at, FILTER, "at $x_t$"), (ends.push_end, COVARIANT, "at the end")):
         for weight, style, weighted in ((torch.ones_like(t), ":", ""), (t, "-", ", times t")):
             label = rf"{name}{weighted}: $\int dt$ = {float((weight * push).mean()):.3f}"
             axis.plot(t, weight * push, color=colour, ls=style, label=label)
-    axis.axhline(float(_size(u_c(x_1))), color=MARK, lw=0.8, ls="--", label="at $x_1$: the softplus's tail")
+    axis.axhline(ends.push_1, color=MARK, lw=0.8, ls="--", label="at $x_1$: the softplus's tail")
     axis.set(ylabel=r"mean $\max_s |u^c|$ at $\lambda = 1$ (workspace units per t)")
     axis.set_title("push on the same pairs, which need none")
-    axis.set_ylim(0, 1.7 * float(end.max()))  # room for the legend
+    axis.set_ylim(0, 1.7 * float(ends.push_end.max()))  # room for the legend
 
 
-def _size(u: Tensor) -> Tensor:
-    """The largest coordinate of shifts u (batch, T, D) along the trajectory, mean over the batch."""
-    return u.abs().amax(dim=(1, 2)).mean()
-
-
-def _told(axis: Axes, t: Tensor, ways: Sequence[Way], violates: Tensor, constraint: Constraint) -> None:
-    """How well three signs tell pairs with a colliding x_1 from the others: share among those minus among these."""
-    M = violates.float()
-    signs = {
-        "$x_t$ collides": [constraint.violation(way.x_t) for way in ways],
-        "the predicted end collides": [constraint.violation(way.end) for way in ways],
-        # Bayes's rule: no other sign that is a function of x_t has a larger difference.
-        r"$E[M | x_t] > E[M]$, the paper's mask: best": [way.weights @ M > M.mean() for way in ways],
-    }
-    looks = ((FILTER, "--"), (COVARIANT, "-"), (MARK, "-."))
-    for (name, found), (colour, style) in zip(signs.items(), looks, strict=True):
-        difference = [float(sign[violates].float().mean() - sign[~violates].float().mean()) for sign in found]
-        axis.plot(t, difference, color=colour, ls=style, label=name)
+def _told(axis: Axes, ends: Ends) -> None:
+    """How well three signs tell pairs with a colliding x_1 from the others."""
+    for tells, colour, style, name in (
+        (ends.at_tells, FILTER, "--", "$x_t$ collides"),
+        (ends.end_tells, COVARIANT, "-", "the predicted end collides"),
+        (ends.mask_tells, MARK, "-.", r"$E[M | x_t] > E[M]$, the paper's mask: best"),
+    ):
+        axis.plot(ends.t, tells, color=colour, ls=style, label=name)
     axis.set(ylabel="share among $D^-$ minus share among $D^+$", title="all pairs: signs that $x_1$ collides")
     axis.set_ylim(top=1.4)  # room for the legend
     axis.set_yticks([0, 0.5, 1])
@@ -370,8 +318,8 @@ def _clearing(
     axis: Axes, at: Sequence[float], times: Sequence[Mapping[str, float]], spans: Mapping[str, float]
 ) -> None:
     """A line for each matrix S over the number of waypoints or the length scale."""
-    for name, look in LOOKS.items():
-        axis.plot(at, [one[name] for one in times], ms=4, label=f"{name}: {spans[name]:.3g}", **look)
+    for name, (label, look) in LOOKS.items():
+        axis.plot(at, [one[name] for one in times], ms=4, label=f"{label}: {spans[name]:.3g}", **look)
     axis.set(xscale="log", yscale="log")
     axis.set_xticks(at, [f"{x:g}" for x in at])
     axis.set_xticks([], minor=True)

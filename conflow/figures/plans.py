@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 
+import torch
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above
+from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above, standing
 from conflow.planner import Planner, Plans
 
 PER_ROW = 3
@@ -19,18 +20,18 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
     Args:
         planner: whose plans they are.
         plans: in the user's units.
-        obstacles: discs (x, y, radius) in the same.
+        obstacles: discs (x, y, radius) in the same, beside those that the task always has.
     """
     figure = Figure(figsize=(4.6, 5.4), layout="constrained")
     axis = figure.add_subplot(aspect="equal")
-    robots, reach = planner.model.task.robots, 1.05 * planner.scale
-    middle = [float(zero) for zero in planner.offset[:2]]
+    task, reach = planner.model.task, 1.05 * planner.scale
+    middle = planner.offset[:2].tolist()
     axis.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[-1] - reach, middle[-1] + reach))
     axis.set(xlabel="x", ylabel="y")
     axis.spines[["top", "right"]].set_visible(False)
     axis.set_title(f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible")
-    paths = seen_from_above(robots, plans.x)
-    for body, robot in enumerate(robots.owner.tolist()):
+    paths = planner.scale * seen_from_above(task.robots, planner.to_workspace(plans.x)) + planner.offset[:2]
+    for body, robot in enumerate(task.robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]
         for shown, drawn in ((plans.feasible, colour), (~plans.feasible, COLLISION)):
             axis.add_collection(LineCollection(list(paths[shown, :, body].numpy()), colors=drawn, alpha=0.4, lw=0.9))
@@ -40,7 +41,11 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
         axis.plot(*paths[0, -1, body], "o", color=colour, zorder=3, ms=11, mfc="none", mew=2)
     axis.plot([], [], color=COLLISION, label="not feasible")
     axis.plot([], [], "o", color="black", ms=11, mfc="none", mew=2, label="goal")
-    for x, y, radius in obstacles:
+    always = [
+        [*(planner.scale * torch.tensor(place) + planner.offset[:2]), planner.scale * radius]
+        for *place, radius in standing(task)
+    ]
+    for x, y, radius in [*obstacles, *always]:
         axis.add_patch(Circle((x, y), radius, color=OBSTACLE, zorder=2.5))
     handles, labels = axis.get_legend_handles_labels()
     named = dict(zip(labels, handles, strict=True))  # each robot once, however many bodies it has

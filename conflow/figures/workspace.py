@@ -12,8 +12,9 @@ from matplotlib.patches import Circle, Rectangle
 from torch import Tensor
 
 from conflow.flow.sampler import states
-from conflow.scene.constraint import Constraint
+from conflow.scene.constraint import Constraint, Sum
 from conflow.scene.robots import Robots
+from conflow.scene.task import Task
 from conflow.training.build import joined, labels
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.datamodule import DemonstrationData
@@ -28,6 +29,7 @@ OF_TRAINING = ("page", "demonstrations", "sources")
 """The pictures that training draws and logs."""
 SHOWN = 60
 DPI = 110
+HAIR = 1e-5
 TIMES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
@@ -44,6 +46,7 @@ def demonstrations(data: DemonstrationData) -> Figure:
         chosen = data.violates == violates
         _trajectories(axis, data.x[chosen], data.violates[chosen], kept)
         axis.set_title(f"{name}: {int(chosen.sum())} of {len(data.x)}")
+    _standing(axes, data.task)
     _legend(figure, data.task.robots)
     return figure
 
@@ -55,18 +58,20 @@ def sources(model: ConFlow, evaluation: Evaluation) -> Figure:
     for axis, (name, x) in zip(axes, panels.items(), strict=True):
         _judged(axis, x, model.trained, name)
     _zoom_out(axes[:1], evaluation.source_samples)
+    _standing(axes, model.task)
     _legend(figure, model.task.robots)
     return figure
 
 
 def page(model: ConFlow, data: DemonstrationData, evaluation: Evaluation, split: SplitName) -> Figure:
-    """A run at a glance: demonstrations of a split, what it starts from, and what it makes under the three settings."""
+    """A run at a glance: demonstrations of a split, what it starts from, and what it makes under every setting."""
     config, after = model.config, 2 + len(model.settings)
     figure, axes = _workspaces(-(-(after + 1) // 3), 3, after + 1)
     _judged(axes[0], data.held_out[split].x, model.trained, f"{SPLITS[split]} demonstrations")
     _judged(axes[1], evaluation.source_samples, model.trained, f"source: {config.source.kind}")
     _zoom_out(axes[1:2], evaluation.source_samples)
     _settings(axes[2:after], model, evaluation)
+    _standing(axes[:after], model.task)
     _clearances(axes[after], evaluation.samples[NONE], model)
     axes[after].set_title("smallest clearance\nno guidance")
     _legend(figure, model.task.robots)
@@ -79,8 +84,11 @@ def methods(runs: Sequence[tuple[str, ConFlow, Evaluation]]) -> Figure:
     columns = max(len(model.settings) for _, model, _ in runs)
     figure, axes = _workspaces(len(runs), columns)
     for i, (name, model, evaluation) in enumerate(runs):
-        row = axes[columns * i :]
-        _settings(row[: len(model.settings)], model, evaluation)
+        row, settings = axes[columns * i : columns * (i + 1)], len(model.settings)
+        _settings(row[:settings], model, evaluation)
+        _standing(row[:settings], model.task)
+        for axis in row[settings:]:  # of a run with fewer settings than another
+            axis.remove()
         row[0].set_ylabel(f"{name}\n\n{row[0].get_ylabel()}")
     _legend(figure, max((model.task.robots for _, model, _ in runs), key=lambda robots: robots.count))
     return figure
@@ -95,6 +103,7 @@ def flow(model: ConFlow, x_0: Tensor, ends: Tensor | None = None) -> Figure:
     for axis, k in zip(axes, shown, strict=True):
         _judged(axis, x[k], model.trained, f"$t = {k / steps:.2g}$")
     _zoom_out(axes, x_0)
+    _standing(axes, model.task)
     _legend(figure, model.task.robots)
     return figure
 
@@ -165,7 +174,7 @@ def _settings(axes: Sequence[Axes], model: ConFlow, evaluation: Evaluation) -> N
             continue
         met = joined([model.judged[name] for name in appears])
         _judged(axis, evaluation.samples[setting], met, titled(setting), "hit it")
-        _obstacles(axis, model)
+        _obstacles(axis, model.task.obstacles(), model.task.robots)
         axis.set_xlabel(
             f"hits unguided: {_share(met.violation(evaluation.samples[NONE]))}\n{axis.get_xlabel()}".strip()
         )
@@ -202,10 +211,23 @@ def seen_from_above(robots: Robots, x: Tensor) -> Tensor:
 
 
 def _contacts(x: Tensor, constraint: Constraint) -> Tensor:
-    """Where trajectories (batch, T, D) are closest to a violation, (batch, 2): amid the bodies that C pushes there."""
-    robots, closest = constraint.robots, (torch.arange(len(x)), constraint.clearance(x).argmin(dim=1))
-    pushed = robots.moved(constraint.gradient(x))[closest][..., None]
-    return (seen_from_above(robots, x)[closest] * pushed).sum(dim=1) / pushed.sum(dim=1)
+    """Where trajectories (batch, T, D) are closest to a violation, (batch, 2): amid the bodies that come so close."""
+    terms = constraint.terms if isinstance(constraint, Sum) else [constraint]
+    clearances = torch.stack([term.clearance(x) for term in terms])
+    places = torch.stack([_closest(x, term, c.argmin(dim=1)) for term, c in zip(terms, clearances, strict=True)])
+    return places[clearances.amin(dim=2).argmin(dim=0), torch.arange(len(x))]
+
+
+def _closest(x: Tensor, constraint: Constraint, waypoint: Tensor) -> Tensor:
+    """Amid the bodies at the waypoints (batch,) on which the smallest of the clearances there depends, (batch, 2)."""
+    robots, each = constraint.robots, torch.arange(len(x))
+    # Of two in one place neither has a direction to go; a hair apart they have.
+    c, pullback = constraint.vjp(x + HAIR * torch.linspace(-1, 1, x.shape[2]))
+    smallest = torch.zeros_like(c)
+    smallest[each, waypoint, c[each, waypoint].argmin(dim=1)] = 1
+    moved = robots.moved(pullback(smallest))[each, waypoint]
+    moved |= ~moved.any(dim=1, keepdim=True)  # where it depends on none, amid all
+    return (seen_from_above(robots, x)[each, waypoint] * moved[..., None]).sum(dim=1) / moved.sum(dim=1, keepdim=True)
 
 
 def _clearances(axis: Axes, x: Tensor, model: ConFlow) -> None:
@@ -222,10 +244,20 @@ def _clearances(axis: Axes, x: Tensor, model: ConFlow) -> None:
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _obstacles(axis: Axes, model: ConFlow) -> None:
-    """The obstacles, and around each the circle that the largest body's centre must not enter."""
-    reach = float(model.task.robots.radii.max())
-    for x, y, radius in model.task.obstacles():
+def standing(task: Task) -> Sequence[tuple[float, float, float]]:
+    """The obstacles (x, y, radius) that are there from the training on: all, where none appears at inference."""
+    return () if task.constraints_at_inference() else task.obstacles()
+
+
+def _standing(axes: Sequence[Axes], task: Task) -> None:
+    for axis in axes:
+        _obstacles(axis, standing(task), task.robots)
+
+
+def _obstacles(axis: Axes, obstacles: Sequence[tuple[float, float, float]], robots: Robots) -> None:
+    """Discs (x, y, radius), and around each the circle that the largest body's centre must not enter."""
+    reach = float(robots.radii.max())
+    for x, y, radius in obstacles:
         axis.add_patch(Circle((x, y), radius, color=OBSTACLE, zorder=2.5))
         axis.add_patch(Circle((x, y), radius + reach, fill=False, ls="--", color="black", lw=1, zorder=3))
 
@@ -242,4 +274,6 @@ def _legend(figure: Figure, robots: Robots) -> None:
             label=f"in collision, crossed where closest (first {SHOWN} drawn)",
         )
     )
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    # The last column has the long entry, beside as many of the robots' as there is room for.
+    columns = 1 + int((figure.get_figwidth() - 4.1) / 1.2)
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)), frameon=False)

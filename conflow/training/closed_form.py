@@ -17,7 +17,13 @@ from conflow.training.build import random_stream
 
 
 class Way(NamedTuple):
-    """Points on straight ways and what is known there: x_t and E[x_1 | x_t] (batch, T, D), weights (batch, N)."""
+    """Points on straight ways from x_0 to x_1, and what is known there.
+
+    Attributes:
+        x_t: the points, (batch, T, D).
+        end: E[x_1 | x_t], (batch, T, D).
+        weights: `posterior`, (batch, N).
+    """
 
     x_t: Tensor
     end: Tensor
@@ -25,7 +31,13 @@ class Way(NamedTuple):
 
 
 def expected(source: Source, x_1: Tensor, t: float) -> Way:
-    """x_t from each demonstration x_1 (N, T, D) and an x_0 of its own, with E[x_1 | x_t]."""
+    """x_t = (1 - t) x_0 + t x_1 of each demonstration x_1 and an x_0 of its own, with E[x_1 | x_t].
+
+    Args:
+        source: of x_0.
+        x_1: demonstrations, (N, T, D).
+        t: the flow's time, in [0, 1).
+    """
     x_0 = source.sample(source.observe(x_1), random_stream("explain"))  # the same at every t
     x_t = interpolate(x_0, x_1, torch.full((len(x_1),), t))
     z, z_1 = (whitened(source, x).float() for x in (x_t, x_1))
@@ -34,11 +46,21 @@ def expected(source: Source, x_1: Tensor, t: float) -> Way:
 
 
 def minimiser(source: Source, x_1: Tensor, M: Tensor, correction: Callable[[Tensor], Tensor], lambda_c: float) -> Field:
-    """The field that minimises L_CG over demonstrations x_1 (N, T, D) with violations M (N,), exactly.
+    """The field that minimises L_CG over finitely many demonstrations, exactly.
 
     v(x, t) = E[x_1 - x_0 | x_t] + lambda_c E[M | x_t] u^c(x_t), the conditional mean of the loss's target. What is
     subtracted off, x_t - E[x_1 | x_t] over 1 - t, brings back everything that no demonstration has. In float64: in the
     source's trailing modes float32's rounding would be larger than what is to be seen.
+
+    Args:
+        source: of x_0.
+        x_1: demonstrations, (N, T, D).
+        M: which of them violate the constraint, boolean (N,).
+        correction: u^c, of x (batch, T, D) in float32.
+        lambda_c: its weight.
+
+    Returns:
+        v of x (batch, T, D), float64, and times t (batch,) that are all the same and below 1.
     """
     z_1, known = whitened(source, x_1), torch.cat([x_1.flatten(1), M[:, None]], dim=1).double()
 
@@ -65,10 +87,13 @@ def posterior(z: Tensor, z_1: Tensor, t: float) -> Tensor:
 
 
 def coordinates(source: Source, x: Tensor) -> Tensor:
-    """z = E^T (x - W x_O) of trajectories x (batch, T, D), (batch, m, D), in float64."""
+    """z = E^T (x - W x_O) of trajectories x (batch, T, D), (batch, m, D), float64, in workspace units.
+
+    E has the source's m modes in its columns, and W x_O is its mean for the observed start and goal.
+    """
     return source.modes.mT @ (x.double() - source.mean(source.observe(x.double())))
 
 
 def whitened(source: Source, x: Tensor) -> Tensor:
-    """`coordinates` in the source's standard deviations, (batch, m D)."""
+    """z_k / sqrt(lambda_k): the `coordinates` in the source's standard deviations, (batch, m D), float64."""
     return (coordinates(source, x) / source.variance.sqrt()[:, None]).flatten(1)
