@@ -96,6 +96,19 @@ def test_what_trains_and_measures_uses_nothing_of_ours_that_is_left_out() -> Non
     }
 
 
+def test_a_users_file_counts_as_far_as_it_is_executed(tmp_path: Path) -> None:
+    """One that cannot be parsed by its text, and one that is gone by nothing."""
+    file, digests = tmp_path / "task.py", []
+    for text in ("x = 1\n", "# A comment.\nx = 1  # and another\n", "x = 2\n", "x = (\n", "x = ( \n"):
+        file.write_text(text)
+        digests.append(code.of_file(file))
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 4
+    assert all(len(digest) == 8 for digest in digests)
+    file.unlink()
+    assert code.of_file(file) == "none"
+
+
 def test_a_run_knows_the_files_in_which_the_present_code_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
     tags = code.tags()
     assert len(tags["code_sha"]) == 16

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from mlflow.entities import Metric
+from mlflow.entities import Metric, Param
 from rich.console import Console
 from scipy import stats
 
@@ -349,6 +349,49 @@ def test_each_split_is_compared_for_itself_and_named_in_every_title(
         assert ("Rows without a model are of the test split." in text) == (split == "val")
         rendered(found, "csv")
         assert f"preset smoke, {name} split" in capsys.readouterr().err.splitlines()
+
+
+def add_described(ablation: str, seed: int, *arguments: str, status: str = "FINISHED") -> None:
+    """A run that keeps its settings, as all do that are trained."""
+    run_id = add_run(ablation, seed, 20, 0.01, *arguments, status=status)
+    settings = config.load(["preset=smoke", f"ablation={ablation}", f"seed={seed}", *arguments])
+    params = [Param(key, str(value)) for key, value in config.flatten(settings.identity()).items()]
+    store.client().log_batch(run_id, params=params)
+
+
+def test_finished_runs_of_other_tasks_data_and_settings_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The newest first, each once, and neither older runs of what is shown nor those that have not finished."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_task.py").write_text("x = 1\n")
+    add_described("cgp", 0)
+    add_described("plus", 0, "task=my_task.py")
+    add_described("cgp", 1, "task=social", "sample.num=16")
+    for _ in range(2):
+        add_described("cgp", 0, "data.num=300")
+    add_described("cgp", 0)
+    add_described("cgp", 2, "data.num=400", status="FAILED")
+    found = collect("smoke")
+    assert found.others == ["cgp-s0 data.num=300", "social-cgp-s1 sample.num=16", "my_task-plus-s0"]
+    said = f"Finished too, of other tasks, data or settings: {', '.join(found.others)}. Compare them by their own ARGS"
+    for form in get_args(printing.Format):
+        text = rendered(found, form)
+        if form == "json":
+            assert json.loads(text)["others"] == found.others
+        else:  # of CSV beside the cells
+            assert said in " ".join((text + capsys.readouterr().err).split())
+    assert len(collect("smoke", ["data.num=300"]).runs["cgp"]) == 1
+    assert collect("smoke", ["data.num=300"]).others[0] == "cgp-s0", "what was shown before is another now"
+    assert collect("smoke", ["task=my_task.py"]).runs.keys() == {"plus"}
+    with pytest.raises(
+        ConfigError, match=r"data.num=77: no such run has finished in .*; there are cgp-s0, cgp-s0 data"
+    ):
+        collect("smoke", ["data.num=77"])
+    many = replace(found, others=[f"cgp-s{seed}" for seed in range(9)])
+    assert "cgp-s5 and 3 more. Compare" in rendered(many, "markdown")
+    assert "cgp-s6" not in rendered(many, "markdown")
 
 
 def test_runs_that_were_not_measured_on_a_split_are_left_out_and_named(

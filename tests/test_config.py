@@ -1,12 +1,17 @@
+import json
+import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from conflow.errors import ConfigError
+from conflow.scene.tasks import TASKS
 from conflow.training import config
-from conflow.training.config import CONF, SIZES
+from conflow.training.config import CONF, OF_SWAPS, SIZES
+from tests.test_layout import loaded
 
 # What each ablation may change of the defaults; "changing only what its name says".
 CHANGES = {
@@ -261,3 +266,200 @@ def test_settings_that_contradict_each_other_are_refused(arguments: list[str], s
     with pytest.raises(ConfigError) as refused:
         config.load(arguments)
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("task", config.names("task"))
+def test_a_task_is_chosen_by_its_name_and_says_how_many_demonstrations_it_has(task: str) -> None:
+    assert task in TASKS
+    assert changes(f"task={task}") - {"task"} <= {"data.num"}
+    settings = config.load([f"task={task}", "ablation=fm", "seed=3"])
+    assert (settings.task, settings.task_name) == (task, task)
+    assert settings.name == ("fm-s3" if task == "swap" else f"{task}-fm-s3")
+
+
+def test_presets_and_arguments_win_over_tasks() -> None:
+    assert config.load(["task=passing"]).data.num == 3000
+    assert config.load(["task=passing", "preset=smoke"]).data.num == config.load(["preset=smoke"]).data.num != 3000
+    assert config.load(["task=passing", "data.num=77"]).data.num == 77
+
+
+@pytest.mark.parametrize("task", ["pasing", "", "my_task.PY", "my_task.py.txt", "../task/swap"])
+def test_a_task_that_there_is_not_is_refused_with_the_names_of_all(task: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        config.load([f"task={task}"])
+    assert str(refused.value).startswith(f"task={task}: expected one of passing, social, swap, a file FILE.py")
+    assert ("did you mean passing?" in str(refused.value)) == (task == "pasing")
+
+
+@pytest.fixture
+def task_file(tmp_path: Path) -> Path:
+    """A file of a task of one's own; the config does not run it."""
+    path = tmp_path / "two_arms.py"
+    path.write_text("raise RuntimeError\n")
+    return path
+
+
+def test_a_file_is_a_task_that_is_called_as_it(task_file: Path) -> None:
+    settings = config.load([f"task={task_file}", "ablation=plus", "seed=2"])
+    assert (settings.task, settings.task_name) == (str(task_file), "two_arms")
+    assert settings.name == "two_arms-plus-s2"
+    assert config.from_tree(settings.tree()) == settings
+    # All else is the same as without it.
+    assert changes(f"task={task_file}") == {"task"}
+
+
+def test_an_experiment_is_what_its_tasks_file_does_wherever_it_lies(task_file: Path, tmp_path: Path) -> None:
+    """Neither a comment nor the folder changes it; a changed number does."""
+    sha = config.load([f"task={task_file}"]).sha()
+    other = tmp_path / "elsewhere" / task_file.name
+    other.parent.mkdir()
+    other.write_text("# a comment\nraise RuntimeError\n")
+    assert config.load([f"task={other}"]).sha() == sha
+    other.write_text("raise RuntimeError(1)\n")
+    assert config.load([f"task={other}"]).sha() != sha
+    assert config.load().sha() != sha
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        *("data.horizon=20", "data.amplitudes=[0.5]", "data.jitter=0.01", "constraint.radius=0.4"),
+        *("sample.obstacle.x=0.2", "sample.obstacle.radius=0.2", "sample.radius=0.25"),
+    ],
+)
+def test_settings_of_swaps_are_refused_for_a_task_of_a_file(argument: str, task_file: Path) -> None:
+    """Which would have no effect there: its file says what they do."""
+    assert argument.startswith(OF_SWAPS)
+    with pytest.raises(ConfigError) as refused:
+        config.load([f"task={task_file}", argument])
+    assert str(refused.value) == f"{argument}: expected one of the tasks passing, social, swap, which it belongs to"
+    config.load(["task=passing", argument])
+
+
+def test_every_setting_of_swaps_is_one_and_all_others_are_taken(task_file: Path) -> None:
+    flat = config.flatten(config.load().tree())
+    for beginning in OF_SWAPS:
+        assert any(key.startswith(beginning) for key in flat)
+    taken = ("constraint.gamma=5", "constraint.pairs=all", "sample.num=20", "data.num=50", "data.path=x.npz")
+    config.load([f"task={task_file}", *taken])
+
+
+def test_pairs_are_the_nearest_or_all() -> None:
+    assert config.load().constraint.pairs == "nearest"
+    assert config.load(["constraint.pairs=all"]).constraint.pairs == "all"
+    with pytest.raises(ConfigError, match=r"constraint\.pairs=each: expected one of nearest, all"):
+        config.load(["constraint.pairs=each"])
+
+
+def replaced(key: str, value: Any) -> Any:
+    """The tree of the defaults with one value replaced, or without the key where it is ...; dotted keys nest."""
+    tree = config.load().tree()
+    *nesting, last = key.split(".")
+    node = tree
+    for name in nesting:
+        node = node[name]
+    if value is ...:
+        del node[last]
+    else:
+        node[last] = value
+    return tree
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("seed", ..., "seed: expected a value, found none"),
+        ("sample.obstacle.y", ..., "sample.obstacle.y: expected a value, found none"),
+        ("train", ..., "train: expected a value, found none"),
+        ("sead", 3, "sead: no such setting, expected one of conf/base.yaml; did you mean seed?"),
+        ("train.max_stepz", 3, "train.max_stepz: no such setting, expected one of conf/base.yaml; did you mean"),
+        ("sample.obstacle.z", 0.1, "sample.obstacle.z: no such setting"),
+        ("seed", "3", "seed=3: expected a whole number"),
+        ("seed", 3.0, "seed=3.0: expected a whole number"),
+        ("seed", True, "seed=True: expected a whole number"),
+        ("seed", None, "seed=None: expected a whole number"),
+        ("train.lr", "fast", "train.lr=fast: expected a finite number"),
+        ("train.lr", True, "train.lr=True: expected a finite number"),
+        ("train.lr", math.nan, "train.lr=nan: expected a finite number"),
+        ("train.lr", math.inf, "train.lr=inf: expected a finite number"),
+        ("train.lr", 10**400, "train.lr=1000"),
+        ("data.negatives", 1, "data.negatives=1: expected true or false"),
+        ("data.negatives", "true", "data.negatives=true: expected true or false"),
+        ("data.path", 3, "data.path=3: expected a text without ${, or null"),
+        ("data.path", "${oc.env:HOME}", "data.path=${oc.env:HOME}: expected a text without ${, or null"),
+        ("ablation", ["cgp"], "ablation=['cgp']: expected a name"),
+        ("task", None, "task=None: expected a name"),
+        ("source.kind", "cpg", "source.kind=cpg: expected one of gaussian, gp, cgp"),
+        ("source.kind", ["cgp"], "source.kind=['cgp']: expected one of gaussian, gp, cgp"),
+        ("source.modes", 1.5, "source.modes=1.5: expected a whole number or null"),
+        ("sample.radius", "null", "sample.radius=null: expected a finite number or null"),
+        ("data.amplitudes", 0.3, "data.amplitudes=0.3: expected [a, b, ...]"),
+        ("data.amplitudes", ["a"], "data.amplitudes=['a']: expected [a, b, ...]"),
+        ("data.amplitudes", [True], "data.amplitudes=[True]: expected [a, b, ...]"),
+        ("data.amplitudes", [0.1] * 65, "data.amplitudes=[0.1, 0.1"),
+        ("data.amplitudes", [0.1, 2.0], "data.amplitudes=[0.1, 2.0]: expected [a, b, ...] of at most 64 numbers of at"),
+        ("train", 3, "train=3: expected nested settings"),
+        ("sample.obstacle", [0.0, 0.5, 0.1], "sample.obstacle=[0.0, 0.5, 0.1]: expected nested settings"),
+        ("train.lr", {"value": 1e-3}, "train.lr={'value': 0.001}: expected a finite number"),
+        ("sample.num", 1, "sample.num=1: expected a whole number of at least 2"),
+        ("correction.width", 4, "correction.width=4: expected an odd number of taps"),
+    ],
+)
+def test_a_tree_with_a_bad_value_is_refused_in_one_line(key: str, value: Any, said: str) -> None:
+    """What a file holds may be from anywhere: its types are checked as those of arguments."""
+    with pytest.raises(ConfigError) as refused:
+        config.from_tree(replaced(key, value))
+    assert str(refused.value).startswith(said)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 200
+
+
+@pytest.mark.parametrize(
+    "tree", [None, [], 3, "text", {}, {3: 4}, {None: {}}, {("seed",): 0}, {**replaced("seed", 0), 3: 4}]
+)
+def test_what_is_no_tree_of_settings_is_refused_in_one_line(tree: Any) -> None:
+    with pytest.raises(ConfigError, match="expected") as refused:
+        config.from_tree(tree)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("train.lr", 1), ("sample.radius", None), ("source.modes", None), ("source.modes", 8), ("data.path", "on")],
+)
+def test_a_tree_may_hold_what_a_setting_may_be(key: str, value: Any) -> None:
+    """A whole number stands for the number that it is, as in YAML, and the config is that of the argument."""
+    settings = config.from_tree(replaced(key, value))
+    found = config.flatten(settings.tree())[key]
+    assert found == value
+    assert isinstance(found, float) == (key == "train.lr")
+    assert settings == config.load([f"{key}={'null' if value is None else value}"])
+
+
+@pytest.mark.parametrize("ablation", config.names("ablation"))
+def test_a_tree_gives_the_config_that_it_was_made_of(ablation: str) -> None:
+    """Read from YAML, of the same types, with the same fingerprint."""
+    settings = config.load([f"ablation={ablation}"])
+    again = config.from_tree(yaml.safe_load(yaml.safe_dump(settings.tree())))
+    assert again == settings
+    assert json.dumps(again.tree()) == json.dumps(settings.tree())
+    assert again.sha() == settings.sha()
+
+
+HEAVY = {"torch", "numpy", "lightning", "mlflow", "omegaconf", "torchmetrics", "matplotlib", "scipy"}
+
+
+@pytest.mark.parametrize(
+    ("code", "needed"),
+    [
+        ("", set()),
+        ("config.load(['preset=smoke', 'ablation=plus', 'task=passing'])", {"omegaconf"}),
+        (f"config.from_tree({config.load(['preset=smoke']).tree()!r})", set()),
+    ],
+    ids=["import", "load", "from_tree"],
+)
+def test_settings_are_read_without_torch_and_a_tree_without_omegaconf(code: str, needed: set[str]) -> None:
+    """A mistyped setting is answered at once, and a finished model is loaded with torch alone."""
+    seen = loaded("-c", f"from conflow.training import config\n{code}")
+    assert {"conflow.training.config", "conflow.flow.settings", "conflow.scene.settings"} <= seen
+    assert HEAVY & {name.split(".")[0] for name in seen} == needed

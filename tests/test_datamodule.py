@@ -1,11 +1,18 @@
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
+from conflow.scene.constraint import Constraint, SpeedLimit
+from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.errors import DemonstrationError
+from conflow.scene.robots import Robots
+from conflow.scene.task import Task
 from conflow.scene.tasks.swap import swap
 from conflow.training import config
 from conflow.training.config import Config
@@ -17,7 +24,7 @@ def rows(split: Split) -> set[bytes]:
     return {x.numpy().tobytes() for x in split.x}
 
 
-def on_file(settings: Config, path: Path, **arrays: np.ndarray) -> Config:
+def on_file(settings: Config, path: Path, **arrays: Any) -> Config:
     np.savez(path, allow_pickle=False, **arrays)
     return dataclasses.replace(settings, data=dataclasses.replace(settings.data, path=str(path)))
 
@@ -140,3 +147,69 @@ def test_repaired_demonstrations_are_all_feasible_and_feasible_ones_are_not_touc
     feasible = ~far.violation(mixed.train.x)
     assert torch.equal(repaired.train.x[feasible], mixed.train.x[feasible])
     assert torch.equal(repaired.test.x, mixed.test.x)
+
+
+class Carts(Robots):
+    D, radii, owner = 3, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.long)
+
+    def points(self, x: Tensor) -> Tensor:
+        return x[:, :, None, :2]
+
+    def pullback(self, x: Tensor, g: Tensor) -> Tensor:
+        return F.pad(g[:, :, 0], (0, 1))
+
+
+class Metres(Task):
+    """A task of one's own: a cart on a plane with an arm, D = 3, as long as 4 s, in metres about the point (10, 20)."""
+
+    T, seconds, scale, offset = 9, 4.0, 5.0, (10.0, 20.0, 0.0)
+
+    def __init__(self) -> None:
+        self.robots = Carts()
+
+    def constraints(self) -> dict[str, Constraint]:
+        return {"speed": SpeedLimit(self.robots, 0.2, self.dt)}
+
+    def demonstrations(self, num: int, seed: int) -> Demonstrations:
+        x = torch.zeros(num, self.T, 3)
+        x[:, :, 0] = torch.linspace(-1, 1, self.T) * torch.linspace(0.1, 1, num)[:, None]
+        return Demonstrations(x)
+
+
+@pytest.mark.parametrize(
+    ("said", "scale", "offset", "seconds"),
+    [
+        ({}, 5.0, [10.0, 20.0, 0.0], 4.0),
+        ({"scale": 2.0}, 2.0, [10.0, 20.0, 0.0], 4.0),
+        ({"offset": [1.0, 2.0]}, 5.0, [1.0, 2.0, 1.0], 4.0),
+        ({"seconds": 8.0}, 5.0, [10.0, 20.0, 0.0], 8.0),
+    ],
+)
+def test_units_and_seconds_are_the_tasks_where_the_file_says_nothing(
+    said: dict[str, Any], scale: float, offset: list[float], seconds: float, smoke: Config, tmp_path: Path
+) -> None:
+    """And so are labels, of a limit to the speed: in twice the time a way may be twice as long."""
+    x = Metres().demonstrations(200, 0).x
+    settings = on_file(smoke, tmp_path / "cart.npz", x=x.numpy(), **said)
+    data = DemonstrationData(settings, Metres())
+    assert (data.task.scale, [*data.task.offset], data.task.seconds) == (scale, offset, seconds)  # type: ignore[misc]
+    assert torch.equal(data.x, x)
+    speed = 2 * x[:, -1, 0] / seconds
+    assert torch.equal(data.violates, speed > 0.2)
+
+
+def test_of_the_programs_own_tasks_a_files_units_hold_for_every_robot(smoke: Config, tmp_path: Path) -> None:
+    data = DemonstrationData(on_file(smoke, tmp_path / "x.npz", x=swap(400).numpy(), scale=3.0, offset=[1.0, 2.0]))
+    assert (data.task.scale, data.task.offset) == (3.0, [1.0, 2.0, 1.0, 2.0])
+    plain = DemonstrationData(on_file(smoke, tmp_path / "y.npz", x=swap(400).numpy()))
+    assert (plain.task.scale, plain.task.offset, plain.task.seconds) == (1.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("shape", [(200, 9, 4), (200, 8, 3), (200, 9, 2)])
+def test_a_file_of_other_waypoints_or_numbers_than_the_tasks_is_refused(
+    shape: tuple[int, ...], smoke: Config, tmp_path: Path
+) -> None:
+    settings = on_file(smoke, tmp_path / "cart.npz", x=np.zeros(shape, np.float32))
+    said = rf"cart\.npz: x has shape \({shape[0]}, {shape[1]}, {shape[2]}\), expected \(N, 9, 3\), .* of task metres"
+    with pytest.raises(DemonstrationError, match=said):
+        DemonstrationData(settings, Metres())

@@ -24,7 +24,7 @@ def published(ablation: str, seed: int, count: int, *arguments: str, preset: str
     metrics: dict[str, float] = {}
     for group in ("test/none", "test/robot", "test/obstacle", "evaluate/sample.solver:rk4/none"):
         metrics |= {f"{group}/num": 1000, f"{group}/robot_collision_count": count, f"{group}/smoothness_median": 0.01}
-    flat = {key: str(value) for key, value in flatten(settings.tree()).items()}
+    flat = {key: str(value) for key, value in flatten(settings.identity()).items()}
     made = Record(f"id-{seed}", ablation, preset, seed, flat, metrics, {"hardware": "a machine"}, 60.0)
     made.write(records.FOLDER)
     return made
@@ -57,6 +57,68 @@ def test_a_record_says_what_was_changed_and_nothing_else() -> None:
     ]
     # As an argument again; Python's None is no value of a setting.
     assert published("spectral", 0, 1, "source.modes=null").changes == ["source.modes=null"]
+
+
+def test_a_record_of_another_task_is_named_by_it(folder: Path) -> None:
+    """Of a named one as of one in a file, with what a run keeps of either; the paper's goes without."""
+    assert published("cgp", 0, 1).name == "cgp-s0"
+    named = published("plus", 3, 20, "task=social", "sample.num=100")
+    assert (named.task, named.name, named.changes) == ("social", "social-plus-s3", ["sample.num=100"])
+    (folder / "elsewhere").mkdir()
+    (folder / "elsewhere" / "my_task.py").write_text("x = 1\n")
+    own = published("plus", 3, 20, "task=elsewhere/my_task.py", "train.lr=0.01")
+    assert (own.task, own.name, own.changes) == ("my_task", "my_task-plus-s3", ["train.lr=0.01"])
+    assert own.name == load(["task=elsewhere/my_task.py", "ablation=plus", "seed=3"]).name
+    assert sorted(path.name for path in records.FOLDER.iterdir()) == [
+        "cgp-quick-s0.json",
+        "my_task-plus-quick-train.lr=0.01-s3.json",
+        "social-plus-quick-sample.num=100-s3.json",
+    ]
+
+
+@pytest.mark.parametrize("task", ["social", "my_task.py"])
+def test_the_command_of_a_row_names_the_task(task: str, folder: Path) -> None:
+    (folder / "my_task.py").write_text("x = 1\n")
+    for seed in range(2):
+        published("plus", seed, 20, f"task={task}")
+    again = f'make ablations ABLATIONS=plus SEEDS="0 1" PRESET=quick TASK={task}'
+    commands = set(comparison.collect_reference()[0].commands.values())
+    assert again in commands
+    # What no model touched is of one run.
+    assert all(command.startswith((again, again.replace("0 1", "0"))) for command in commands)
+
+
+def test_a_task_of_ones_own_has_a_column_for_each_setting_and_constraint(folder: Path) -> None:
+    """Those without guidance first; the paper has no numbers for it, and its claims are none of it."""
+    (folder / "my_task.py").write_text("x = 1\n")
+    for seed in range(2):
+        made = published("plus", seed, 0, "task=my_task.py")
+        metrics: dict[str, float] = {}
+        for setting in ("all", "none"):
+            metrics |= {f"test/{setting}/num": 100, f"test/{setting}/speed_collision_count": 7 + seed}
+            metrics |= {f"test/{setting}/end_in_box_collision_count": 3, f"test/{setting}/success_count": 90}
+        replace(made, metrics=metrics).write(records.FOLDER)
+    (found,) = comparison.collect_reference()
+    columns = [c.column for c in found.cells if c.table == "1"]
+    assert columns == ["none: end_in_box", "none: speed", "all: end_in_box", "all: speed"]
+    one = cell(found, "1", "plus: the best together", "all: speed")
+    assert (one.count, one.trajectories, one.paper, one.differs) == (15, 200, None, None)
+    assert (found.claims, found.reasons) == ([], {})
+    assert {c.table for c in found.cells} == {"1", "3"}
+
+
+def test_the_overview_shows_the_papers_methods_and_the_best_alone() -> None:
+    for preset in ("quick", "long"):
+        for ablation in ("cgp", "spectral", "plus"):
+            published(ablation, 0, 20, preset=preset)
+    console = Console(width=400)
+    with console.capture() as captured:
+        printing.render(comparison.collect_reference(), "markdown", console)
+    text = captured.get()
+    overview = text[text.index("**Robot collisions without guidance, at each preset, test split**") :].splitlines()
+    rows = [line.split(" | ")[0].removeprefix("| ") for line in overview[4:] if line.startswith("| ")]
+    assert rows == ["ConFlow (D+ and D-)", "plus: the best together"]
+    assert "| spectral network" in text, "in the tables of its preset it is"
 
 
 def test_a_setting_that_came_later_counts_as_its_default() -> None:

@@ -123,9 +123,16 @@ class Mine(conflow.Task):
         (COMPLETE + '    def settings(self): return {"a": ("b",)}\n', "setting a guides around b, expected names of"),
         (
             COMPLETE + '    def settings(self): return {"none": ("walls",)}\n',
-            "expected names without a slash, and no setting",
+            "expected no setting named none",
         ),
-        (COMPLETE.replace("walls", "w/alls"), "expected names without a slash"),
+        *(
+            (COMPLETE.replace('"walls"', name), "expected a name of letters, digits, _ and -, other than torch's own")
+            for name in ('"w/alls"', '"wall.left"', '"wall (left)"', '""', '"type"', "3", "None")
+        ),
+        (
+            COMPLETE + "    def constraints_at_inference(self): return self.constraints()\n",
+            "expected other names at inference, found walls",
+        ),
         ("import conflow\nTask = conflow.Task\n", "expected one class that is a conflow.Task, found none"),
         ("from conflow.scene.tasks.swap import Swap\n", "expected one class that is a conflow.Task, found none"),
         (COMPLETE + "    def __init__(self, limit): pass\n", "TypeError: "),
@@ -138,7 +145,8 @@ class Mine(conflow.Task):
     ],
     ids=[
         *("none", "two", "fails", "syntax", "abstract", "no robots", "no constraint", "unknown constraint"),
-        *("setting none", "slash", "imported base", "imported task", "argument", "fails when made", "import"),
+        *("setting none", "slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
+        *("imported base", "imported task", "argument", "fails when made", "import"),
         *("exit", "no robot", "mistyped method", "no text"),
     ],
 )

@@ -49,7 +49,8 @@ def test_a_run_is_finished_named_tagged_and_has_every_setting(trained: tuple[Run
     assert run.info.status == "FINISHED"
     assert run.info.run_name == "cgp-s3"
     settings = config.load(SETTINGS_ARGUMENTS)
-    assert {key: run.data.tags[key] for key in ("ablation", "preset", "seed", "config_sha")} == {
+    assert {key: run.data.tags[key] for key in ("task", "ablation", "preset", "seed", "config_sha")} == {
+        "task": "swap",
         "ablation": "cgp",
         "preset": "smoke",
         "seed": "3",
@@ -64,7 +65,8 @@ def test_a_run_holds_the_documented_metrics(trained: tuple[Run, str]) -> None:
     run, _ = trained
     expected = {"train/loss", "train/grad_norm", "train/steps_per_second", "train/seconds", "val/loss"}
     for setting in SETTINGS:
-        for metric in ("robot_collision", "object_collision", "robot_collision_swept", "success", "outside"):
+        swept = ("robot_collision_swept", "object_collision_swept")
+        for metric in ("robot_collision", "object_collision", *swept, "near", "success", "outside"):
             expected |= {f"test/{setting}/{metric}_{part}" for part in ("rate", "low", "high", "count")}
         values = ("smoothness_median", "smoothness_p95", "start_error", "end_error", "diversity", "energy_distance")
         for metric in (*values, "path_length_median"):

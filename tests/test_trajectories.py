@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from conflow.scene.demonstrations import check, digest, load
+from conflow.scene.demonstrations import Demonstrations, check, digest, load, save
 from conflow.scene.errors import DemonstrationError
 from conflow.scene.tasks.curves import SIDES
 from conflow.scene.tasks.swap import Swap, swap
@@ -226,6 +226,58 @@ def test_an_unusable_file_is_refused_in_one_line(tmp_path: Path, write: Callable
     with pytest.raises(DemonstrationError, match=reason) as refusal:
         load(path)
     assert str(refusal.value).startswith(f"data.path={path}: ")
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_file_may_say_in_which_units_and_how_long(tmp_path: Path) -> None:
+    """Numbers of any kind arrive as floats; what the file does not say is left to the task."""
+    path = tmp_path / "demonstrations.npz"
+    np.savez(path, x=swap(3).numpy(), scale=np.int64(4), offset=np.array([1, -0.5], np.float32), seconds=2.5)
+    loaded = load(path)
+    assert (loaded.scale, loaded.offset, loaded.seconds) == (4.0, [1.0, -0.5], 2.5)
+    assert isinstance(loaded.scale, float)
+    np.savez(path, x=swap(3).numpy(), seconds=2)
+    assert load(path)[1:] == (None, None, None, 2.0)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        Demonstrations(swap(3)),
+        Demonstrations(swap(3), torch.tensor([True, False, True]), 4.0, [1.0, -0.5], 2.5),
+        Demonstrations(swap(3), scale=3.0),
+        Demonstrations(swap(3), offset=[0.0, 0.0]),
+    ],
+)
+def test_what_is_saved_is_loaded(written: Demonstrations, tmp_path: Path) -> None:
+    save(tmp_path / "new.npz", written)
+    loaded = load(tmp_path / "new.npz")
+    assert torch.equal(loaded.x, written.x)
+    labels = [None if one.violates is None else one.violates.tolist() for one in (loaded, written)]
+    assert labels[0] == labels[1]
+    assert loaded[2:] == written[2:]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("scale", [1.0, 2.0], r"scale has shape \(2,\), expected \(\), finite numbers"),
+        ("scale", "2", "scale has shape .*, expected"),
+        ("scale", True, "scale has shape .*, expected"),
+        ("scale", math.nan, "scale has shape .*, finite numbers"),
+        ("scale", 0.0, "scale=0.0: expected a number above 0"),
+        ("seconds", -1, "seconds=-1.0: expected a number above 0"),
+        ("offset", 1.0, r"offset has shape \(\), expected \(2,\)"),
+        ("offset", [1.0, 2.0, 3.0], r"offset has shape \(3,\), expected \(2,\)"),
+        ("offset", [0.0, math.inf], "offset has shape .*, finite numbers"),
+    ],
+)
+def test_numbers_of_a_file_that_cannot_be_used_are_refused(name: str, value: Any, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "demonstrations.npz"
+    arrays: dict[str, Any] = {"x": swap(3).numpy(), name: value}
+    np.savez(path, **arrays)
+    with pytest.raises(DemonstrationError, match=f"^data.path={path}: {said}") as refusal:
+        load(path)
     assert "\n" not in str(refusal.value)
 
 

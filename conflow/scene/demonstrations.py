@@ -12,29 +12,25 @@ from torch import Tensor
 
 from conflow.scene.errors import DemonstrationError
 
-NUMBERS: dict[str, tuple[tuple[int, ...], float | list[float]]] = {
-    "scale": ((), 1.0),
-    "offset": ((2,), [0.0, 0.0]),
-    "seconds": ((), 1.0),
-}
-"""What a file may say beside its trajectories: the shape, and what holds where it does not."""
+NUMBERS: dict[str, tuple[int, ...]] = {"scale": (), "offset": (2,), "seconds": ()}
+"""What a file may say beside its trajectories, and the shape of it."""
 
 
 class Demonstrations(NamedTuple):
-    """Trajectories and what their author says of them.
+    """Trajectories and what their author says of them; what is None is left to the task.
 
     Attributes:
         x: (N, T, D), in workspace units.
-        violates: M, boolean (N,), where they are labelled.
+        violates: M, boolean (N,).
         scale, offset: the user's coordinates are `scale` x + `offset`, a number for each of the plane's two axes.
         seconds: how long one takes.
     """
 
     x: Tensor
     violates: Tensor | None = None
-    scale: float = 1.0
-    offset: Sequence[float] = (0.0, 0.0)
-    seconds: float = 1.0
+    scale: float | None = None
+    offset: Sequence[float] | None = None
+    seconds: float | None = None
 
 
 def load(path: str | Path) -> Demonstrations:
@@ -70,24 +66,25 @@ def load(path: str | Path) -> Demonstrations:
     with np.errstate(over="ignore"):  # `check` refuses what becomes infinite
         x = x.astype(np.float32)
     labels = None if violates is None else torch.from_numpy(violates)
-    return Demonstrations(torch.from_numpy(x), labels, *_numbers(path, arrays))
+    return Demonstrations(torch.from_numpy(x), labels, **_numbers(path, arrays))
 
 
-def _numbers(path: str | Path, arrays: Mapping[str, np.ndarray]) -> tuple[float, list[float], float]:
+def _numbers(path: str | Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Scale, offset and seconds, where a file has them."""
-    values = []
-    for name, (shape, default) in NUMBERS.items():
-        array = arrays.get(name, np.array(default))
+    values = {}
+    for name, shape in NUMBERS.items():
+        if name not in arrays:
+            continue
+        array = arrays[name]
         numeric = np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
         if array.shape != shape or not numeric or not np.isfinite(array).all():
             raise DemonstrationError(
                 f"data.path={path}: {name} has shape {array.shape}, expected {shape}, finite numbers"
             )
-        values.append(array.tolist())
-    scale, offset, seconds = values
-    if not (scale > 0 and seconds > 0):
-        raise DemonstrationError(f"data.path={path}: scale={scale}, seconds={seconds}: expected numbers above 0")
-    return float(scale), [float(zero) for zero in offset], float(seconds)
+        values[name] = array.astype(np.float64).tolist()
+        if name != "offset" and not values[name] > 0:
+            raise DemonstrationError(f"data.path={path}: {name}={values[name]}: expected a number above 0")
+    return values
 
 
 def check(x: Tensor, name: str) -> None:
@@ -129,15 +126,8 @@ def save(path: str | Path, made: Demonstrations) -> None:
     try:
         with tempfile.TemporaryDirectory(prefix=".conflow-", dir=path.parent) as folder:
             part = Path(folder, path.name)
-            arrays: dict[str, Any] = {
-                "x": made.x.numpy(),
-                "scale": made.scale,
-                "offset": made.offset,
-                "seconds": made.seconds,
-            }
-            if made.violates is not None:
-                arrays["violates"] = made.violates.numpy()
-            np.savez(part, **arrays)
+            said: dict[str, Any] = {name: value for name, value in made._asdict().items() if value is not None}
+            np.savez(part, **said)
             path.hardlink_to(part)  # which, unlike a rename, refuses to replace a file
     except OSError as error:
         raise DemonstrationError(f"out={path}: {error.strerror}, expected a new file in an existing folder") from None

@@ -3,6 +3,7 @@
 import hashlib
 import importlib.util
 import inspect
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -85,16 +86,24 @@ def checked(task: Task, name: str) -> Task:
     """
     if not hasattr(task, "robots"):
         raise ConfigError(f"task={name}: expected an attribute robots, such as conflow.Discs(count=1, radius=0.05)")
-    known = {*task.constraints(), *task.constraints_at_inference()}
-    if not task.constraints():
+    trained, at_inference = {*task.constraints()}, {*task.constraints_at_inference()}
+    known = trained | at_inference
+    if not trained:
         raise ConfigError(f"task={name}: expected a constraint in constraints(), found none")
+    for one in (*known, *task.settings()):
+        # They become parts of metrics' names, and of a torch module.
+        if not isinstance(one, str) or not re.fullmatch(r"[\w-]+", one) or hasattr(torch.nn.ModuleDict, one):
+            expected = "expected a name of letters, digits, _ and -, other than torch's own"
+            raise ConfigError(f"task={name}: {brief(one)}: {expected}")
+    if twice := sorted(trained & at_inference):
+        raise ConfigError(f"task={name}: expected other names at inference, found {', '.join(twice)}")
     for setting, guided in task.settings().items():
         for constraint in guided:
             if constraint not in known:
                 expected = f"expected names of constraints, {', '.join(sorted(known))}"
                 raise ConfigError(f"task={name}: setting {setting} guides around {constraint}, {expected}")
-    if "none" in task.settings() or any("/" in one for one in (*known, *task.settings())):
-        raise ConfigError(f"task={name}: expected names without a slash, and no setting named none")
+    if "none" in task.settings():
+        raise ConfigError(f"task={name}: expected no setting named none, which is that without guidance")
     return task
 
 

@@ -115,8 +115,9 @@ class DemonstrationData(LightningDataModule):
             origin, found = f"data.path={data.path}", demonstrations.load(data.path)
             demonstrations.check(found.x, origin)
             task = task or self._task_of(found.x, origin)
-            task.scale, task.seconds = found.scale, found.seconds
-            task.offset = [*found.offset] * (task.robots.D // len(found.offset))
+            task.scale, task.seconds = found.scale or task.scale, found.seconds or task.seconds
+            if found.offset is not None:
+                task.offset = [found.offset[i % len(found.offset)] for i in range(task.robots.D)]
         else:
             task = task or build_task(self.config)
             # The whole once more in the splits, and twice while it is generated.

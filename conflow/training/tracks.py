@@ -122,8 +122,8 @@ def read(
         agents: how many meet.
         seconds: length of a window.
         T: waypoints, the first and the last at the window's ends.
-        fps: frame numbers per second, where the file does not say it. ETH annotates every sixth frame at 15 per
-            second, UCY every tenth at 25: 15 and 25 are meant here.
+        fps: frame numbers per second, where the file does not say it. ETH's obsmat.txt has every sixth frame of 15 per
+            second: 15. Its hotel, UCY and the files that Social-GAN distributes have every tenth of 25: 25.
         opposite: only sets of which two walk in opposite directions, by their displacements over the window.
         near: metres. Who never comes that close does not meet.
 
@@ -133,7 +133,7 @@ def read(
     _check(agents, seconds, T, fps, near)
     table = _table(Path(path))
     rate = _frame_rate(path, table.fps, fps)
-    tracks, read_in = _tracks(table, rate)
+    tracks, read_in = _tracks(path, table, rate)
     long = tracks.select(tracks.last - tracks.first >= seconds * rate - 1e-9)
     meetings = _cut(long, seconds * rate) if agents == 1 else _meetings(long, agents, near)
     found = _Found(len(tracks.ids), len(long.ids), len(meetings.frame))
@@ -435,8 +435,12 @@ class _Tracks:
         return _Tracks(self.frame[rows], self.x[rows], start, self.ids[which], self.step)
 
 
-def _tracks(table: _Table, fps: float) -> tuple[_Tracks, str]:
-    """The tracks of a table, and how they came about."""
+def _tracks(path: str | Path, table: _Table, fps: float) -> tuple[_Tracks, str]:
+    """The tracks of a table, and how they came about.
+
+    Raises:
+        ConfigError: no row can be used.
+    """
     seen = np.isfinite(table.x).all(axis=1)
     ids, frame, x = table.id[seen], table.frame[seen], table.x[seen]
     order = np.lexsort((x[:, 1], x[:, 0], frame, ids))
@@ -446,19 +450,21 @@ def _tracks(table: _Table, fps: float) -> tuple[_Tracks, str]:
     ids, frame, x, again = ids[~repeated], frame[~repeated], x[~repeated], again[~repeated]
     contradicts = again | np.append(again[1:], False)[: len(ids)]
     ids, frame, x = ids[~contradicts], frame[~contradicts], x[~contradicts]
-
-    same, distance = np.diff(ids) == 0, np.diff(frame)
-    step = int(np.median(distance[same])) if same.any() else 1
-    gap = same & (distance - step > GAP * fps + 1e-9)
-    filled = same & ~gap & (distance >= 2 * step)
-    start = np.flatnonzero(np.concatenate([[True], ~same | gap])[: len(ids)])
     left_out = _listed(
         (int(repeated.sum()), "repeated rows"),
         (int(contradicts.sum()), "rows that put an agent at two places in one frame"),
         (int((~seen).sum()), "rows without a position"),
     )
+    if not len(ids):
+        raise ConfigError(f"from={path}: has {left_out}, expected some others; {table.says}")
+
+    same, distance = np.diff(ids) == 0, np.diff(frame)
+    step = int(np.median(distance[same])) if same.any() else 1
+    gap = same & (distance - step > GAP * fps + 1e-9)
+    filled = same & ~gap & (distance >= 2 * step)
+    start = np.flatnonzero(np.concatenate([[True], ~same | gap]))
     read_in = (
-        f"{seen.size} rows, {table.says}; {fps:g} frames per second, of which every {step} is there. Left out: "
+        f"{seen.size} rows, {table.says}; {fps:g} frames per second, in steps of {step}. Left out: "
         f"{left_out}. {len(np.unique(ids))} ids make {len(start)} tracks, with {int(filled.sum())} gaps of up to "
         f"{GAP:g} s filled and {int(gap.sum())} longer ones split."
     )
@@ -558,7 +564,7 @@ def _nearest(members: IntArray, distance: FloatArray, frame: IntArray) -> tuple[
     """Of each set the smallest distance and its frame, the first of several."""
     order = np.lexsort((frame, distance, *members.T[::-1]))
     members, distance, frame = members[order], distance[order], frame[order]
-    new = np.concatenate([[True], (np.diff(members, axis=0) != 0).any(axis=1)])[: len(members)]
+    new = np.concatenate([[True], np.any(members[1:] != members[:-1], axis=1)])[: len(members)]
     return members[new], distance[new], frame[new]
 
 
@@ -599,7 +605,8 @@ def _order(positions: FloatArray) -> IntArray:
 
 def _longest(tracks: _Tracks, agents: int) -> float:
     """For how many frames at most the same `agents` tracks are present together."""
-    best, ends = 0, [0] * 0
+    best = 0
+    ends: list[int] = []
     for first, last in sorted(zip(tracks.first.tolist(), tracks.last.tolist(), strict=True)):
         heapq.heappush(ends, last)
         if len(ends) > agents:
@@ -632,10 +639,10 @@ def _windows_found(found: _Found, agents: int, seconds: float, near: float, oppo
     short = f"{found.tracks - found.long} tracks are shorter than {seconds:g} s."
     if agents == 1:
         return f"{short} The others give {found.windows} windows."
-    aligned = f" and {found.inside - found.windows} in which no two walk in opposite directions" if opposite else ""
+    aligned = f", in {found.inside - found.windows} no two walk in opposite directions" if opposite else ""
     return (
-        f"{short} Of the others {found.sets} sets of {agents} come within {near:g} m of each other; without "
-        f"{found.sets - found.inside} that meet too near to a track's end{aligned} they give {found.windows} windows."
+        f"{short} Of the others {found.sets} sets of {agents} come within {near:g} m of each other: "
+        f"{found.sets - found.inside} meet too near to a track's end{aligned}, {found.windows} are windows."
     )
 
 
@@ -646,10 +653,10 @@ def _sizes(x: Tensor, scale: float) -> str:
     if x.shape[2] < 4:
         return text
     distance = closest(x).double().sort().values
-    radii = []
+    radii: dict[float, str] = {}  # few windows may have the same for several shares
     for share in QUANTILES:
         reached = float(distance[math.ceil(share * len(distance)) - 1])
         radius = (math.floor(1000 * reached) + 1) / 1000  # as it is printed, and above
         infeasible = float((distance < radius).double().mean())
-        radii.append(f"{radius:.3f} ({radius * scale:.2f} m) makes {100 * infeasible:.0f} %")
-    return f"{text} As constraint.radius, {', '.join(radii)} of them infeasible."
+        radii[radius] = f"{radius:.3f} ({radius * scale:.2f} m) makes {100 * infeasible:.0f} %"
+    return f"{text} As constraint.radius, {', '.join(radii.values())} of them infeasible."
