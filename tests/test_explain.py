@@ -286,9 +286,10 @@ def published(preset: str, *rates: tuple[str, int, float | None]) -> Comparison:
 
 
 def test_the_front_has_a_point_for_each_method_and_preset() -> None:
-    """Those without a distance are left out."""
+    """Those without a distance are left out, and those of other tasks than the paper's."""
     quick = published("quick", (METHODS["cgp"], 301, 0.04), (METHODS["fm"], 270, None))
-    (axis,) = front([published("long", (METHODS["cgp"], 16, 0.0)), quick]).axes
+    other = replace(published("quick", ("ConFlow, task=social", 20, 0.1)), task="social")
+    (axis,) = front([published("long", (METHODS["cgp"], 16, 0.0)), quick, other]).axes
     assert points(axis) == {
         "ConFlow (D+ and D-), quick": [pytest.approx([0.04, 0.301])],
         "ConFlow (D+ and D-), long": [pytest.approx([0.0, 0.016])],

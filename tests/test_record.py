@@ -1,9 +1,12 @@
 """What is published of a run, and the tables that are made of it alone."""
 
+import csv
+import io
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from rich.console import Console
@@ -101,10 +104,65 @@ def test_a_task_of_ones_own_has_a_column_for_each_setting_and_constraint(folder:
     (found,) = comparison.collect_reference()
     columns = [c.column for c in found.cells if c.table == "1"]
     assert columns == ["none: end_in_box", "none: speed", "all: end_in_box", "all: speed"]
-    one = cell(found, "1", "plus: the best together", "all: speed")
+    one = cell(found, "1", "plus: the best together, task=my_task.py", "all: speed")
     assert (one.count, one.trajectories, one.paper, one.differs) == (15, 200, None, None)
     assert (found.claims, found.reasons) == ([], {})
     assert {c.table for c in found.cells} == {"1", "3"}
+
+
+def test_records_of_several_tasks_are_compared_apart(folder: Path) -> None:
+    """Of one ablation at one preset, changed or not: the paper's task first, the rows of others named by theirs."""
+    (folder / "my_task.py").write_text("x = 1\n")
+    for task, count in (("social", 20), ("my_task.py", 30), ("swap", 40)):
+        for ablation in ("cgp", "plus"):
+            published(ablation, 0, count, f"task={task}")
+        published("cgp", 0, count + 1, f"task={task}", "train.batch_size=512")
+    published("cgp", 0, 50, preset="long")
+    found = comparison.collect_reference()
+    places = [(one.preset, one.task) for one in found]
+    assert places == [("long", "swap"), ("quick", "swap"), ("quick", "my_task.py"), ("quick", "social")]
+    change = "ConFlow (D+ and D-), train.batch_size=512"
+    for one, count, of_task in zip(found[1:], (40, 30, 20), ("", ", task=my_task.py", ", task=social"), strict=True):
+        row = cell(one, "1", f"plus: the best together{of_task}", "none: robot")
+        assert (row.count, row.seeds, row.paper is None) == (count, 1, True)
+        assert cell(one, "4", f"{change}{of_task}", "none: robot").count == count + 1
+        shown = {each.column if each.table == "2" else each.row for each in one.cells}
+        assert shown <= one.commands.keys()
+        assert all(name.endswith(of_task) for name in (*shown, *one.commands))
+        assert all((f"TASK={one.task}" in again) == (one.task != "swap") for again in one.commands.values())
+
+
+def test_every_format_says_of_which_task_a_number_is() -> None:
+    """And the overview is of the paper's alone: no column of it is another task's."""
+    for preset in ("long", "quick"):
+        published("plus", 0, 20, "task=social", preset=preset)
+    published("plus", 0, 40)
+    found = comparison.collect_reference()
+    text = {}
+    for form in get_args(printing.Format):
+        console = Console(width=400)
+        with console.capture() as captured:
+            printing.render(found, form, console)
+        text[form] = captured.get()
+    tree = json.loads(text["json"])
+    assert list(tree["presets"]) == ["quick", "long, task=social", "quick, task=social"]
+    rows = [(one["preset"], one["row"]) for one in tree["cells"]]
+    assert rows == [(line["preset"], line["row"]) for line in csv.DictReader(io.StringIO(text["csv"]))]
+    counts = {one["count"] for one in tree["cells"] if one["row"] == "plus: the best together, task=social"}
+    assert {20} <= counts <= {20, None}
+    titles = [line for line in text["markdown"].splitlines() if line.startswith("**Table 1")]
+    assert [title.partition("is hit), ")[2] for title in titles] == [
+        "preset quick, test split**",
+        "task social, preset long, test split**",
+        "task social, preset quick, test split**",
+    ]
+    assert "at each preset" not in text["markdown"], "of the paper's task there is one preset"
+    published("plus", 0, 50, preset="long")
+    with console.capture() as captured:
+        printing.render(comparison.collect_reference(), "markdown", console)
+    overview = captured.get().partition("at each preset, ")[2].splitlines()
+    assert overview[2] == "|  | paper | long | quick |"
+    assert [line.split(" | ")[0] for line in overview[4:] if line.startswith("| ")] == ["| plus: the best together"]
 
 
 def test_the_overview_shows_the_papers_methods_and_the_best_alone() -> None:

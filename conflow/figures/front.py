@@ -8,6 +8,7 @@ from matplotlib.lines import Line2D
 
 from conflow.results.comparison import Comparison
 from conflow.results.tables import GUARDS, METHODS, Cell
+from conflow.training.config import PAPERS_TASK
 
 RATE, DISTANCE, *_ = GUARDS.values()
 SHORT = {method: ablation for ablation, method in METHODS.items()}
@@ -16,13 +17,14 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MARKERS = "osD^vP*X<>pdh8"
 
 
-def front(comparisons: Sequence[Comparison]) -> Figure:
-    """Unguided robot collisions, with 95 % intervals, against the energy distance to held-out D+.
+def front(published: Sequence[Comparison]) -> Figure:
+    """Unguided robot collisions, with 95 % intervals, against the energy distance to held-out D+, on the paper's task.
 
     Intervals are over seeds; of one seed, within its network.
     A point for each method and preset, over its seeds, and a line from one preset of a method to the other: the
     nearer to the lower left the better.
     """
+    comparisons = [one for one in published if one.task == PAPERS_TASK]
     presets = sorted(one.preset for one in comparisons if one.claims)
     figure = Figure(figsize=(10.8, 6.2), layout="constrained")
     axis = figure.subplots()

@@ -1,7 +1,7 @@
 """The paper's tables and claims and tables of our own, filled from finished runs or from the records of them alone."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from conflow.errors import ConfigError
 from conflow.results import paper, records
@@ -16,7 +16,7 @@ from conflow.training.evaluation import UNCHANGED
 
 @dataclass(frozen=True)
 class Comparison:
-    """The cells of all tables at one preset, the claims, which runs they come from, and how to make a row again.
+    """The cells of all tables of a task at one preset, the claims, which runs they are of, and how to make a row again.
 
     Attributes:
         commands: what makes a row again, by its name.
@@ -26,6 +26,7 @@ class Comparison:
         split: whose starts and goals the models were given; rows without a model are always of the test split.
         left_out: the names of finished runs that were not measured on it.
         others: finished runs at the preset that are of other tasks, data or settings.
+        task: as `TASK=` names it.
     """
 
     preset: str
@@ -39,6 +40,7 @@ class Comparison:
     split: SplitName
     left_out: list[str]
     others: list[str]
+    task: str = PAPERS_TASK
 
 
 def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val") -> Comparison:
@@ -70,21 +72,42 @@ def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val"
 
 
 def collect_reference() -> list[Comparison]:
-    """Compare the records under runs/reference/ on test, preset by preset from the one of the most training down.
+    """Compare the records under runs/reference/ on test, each task's for themselves, the paper's first.
 
-    A preset that has changed runs alone, with nothing to compare them with, comes last.
+    Preset by preset from the one of the most training down. One that has changed runs alone, with nothing to compare
+    them with, comes last.
 
     Raises:
         ConfigError: there are none.
     """
-    published = [one.on("test") for one in records.from_files()]
-    found = []
-    for preset in sorted({one.preset for one in published}, key=_scale, reverse=True):
-        plain = [one for one in published if one.preset == preset and not one.changes]
-        changed = [one for one in published if one.preset == preset and one.changes]
-        runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
-        found.append(_comparison(preset, runs, readings, _of_different_code(runs | readings), "test", []))
-    return sorted(found, key=lambda one: not one.claims)
+    places: dict[tuple[str, str], list[Record]] = {}
+    for one in records.from_files():
+        places.setdefault((one.chosen, one.preset), []).append(one.on("test"))
+    found = [_of_records(of_place) for of_place in places.values()]
+    return sorted(found, key=lambda one: (one.task != PAPERS_TASK, one.task, _changed_alone(one), -_scale(one.preset)))
+
+
+def _of_records(published: Sequence[Record]) -> Comparison:
+    """Compare records of one task at one preset."""
+    plain, changed = ([one for one in published if bool(one.changes) == of_changed] for of_changed in (False, True))
+    runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
+    found = _comparison(published[0].preset, runs, readings, _of_different_code(runs | readings), "test", [])
+    return found if found.task == PAPERS_TASK else _with_task(found)
+
+
+def _with_task(found: Comparison) -> Comparison:
+    """The same with the task in the name of every row, as rows of other tasks stand beside them."""
+    of_task = f", task={found.task}"
+    cells = [
+        # In Table 2 methods are columns.
+        replace(one, column=one.column + of_task) if one.table == "2" else replace(one, row=one.row + of_task)
+        for one in found.cells
+    ]
+    return replace(found, cells=cells, commands={name + of_task: again for name, again in found.commands.items()})
+
+
+def _changed_alone(found: Comparison) -> bool:
+    return all(one.table != "1" for one in found.cells)
 
 
 def _scale(preset: str) -> int:
@@ -141,19 +164,20 @@ def _comparison(
 ) -> Comparison:
     cells = tables(runs, readings)
     rows = dict(runs) | dict(readings)
-    settings = (rows.get("cgp") or next(iter(rows.values())))[0].settings
+    first = (rows.get("cgp") or next(iter(rows.values())))[0]
     return Comparison(
         preset,
         cells,
         claims(runs),
         {name: [one.run_id for one in of_row] for name, of_row in rows.items()},
         _commands(runs, readings, split),
-        " ".join(f"{key}={settings[key]}" for key in paper.OPEN if key in settings),
+        " ".join(f"{key}={first.settings[key]}" for key in paper.OPEN if key in first.settings),
         _reasons(cells),
         of_code,
         split,
         left_out,
         list(others),
+        first.chosen,
     )
 
 
@@ -198,5 +222,5 @@ def _command(runs: Sequence[Record]) -> str:
     changes = [change.replace(", ", ",") for change in one.changes]
     arguments = f" ARGS='{' '.join(changes)}'" if changes else ""
     if one.task != PAPERS_TASK:
-        arguments = f" TASK={one.task if one.of_task else f'{one.task}.py'}{arguments}"
+        arguments = f" TASK={one.chosen}{arguments}"
     return f'make ablations ABLATIONS={one.ablation} SEEDS="{seeds}" PRESET={one.preset}{arguments}'

@@ -15,7 +15,7 @@ from conflow.errors import ConfigError
 from conflow.results.claims import Claim
 from conflow.results.comparison import Comparison
 from conflow.results.tables import COLLISIONS, ELSEWHERE, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell
-from conflow.training.config import SPLITS
+from conflow.training.config import PAPERS_TASK, SPLITS
 from conflow.training.summary import digits
 
 AGAIN = "again with"
@@ -67,16 +67,23 @@ def render(comparisons: Sequence[Comparison], form: Format, console: Console) ->
     else:
         for one in comparisons:
             _print_sheets(_sheets(one), form, console)
-            console.out(f"Unless a row says otherwise, at preset {one.preset}: {one.reading}\n", highlight=False)
+            console.out(f"Unless a row says otherwise, at {_place(one)}: {one.reading}\n", highlight=False)
             for line in _reservations(one):
                 console.out(f"{line}\n", highlight=False)
-        if len(comparisons) > 1:
-            _print_sheets([_overview(comparisons)], form, console)
+        of_paper = [one for one in comparisons if one.task == PAPERS_TASK]
+        if len(of_paper) > 1:
+            _print_sheets([_overview(of_paper)], form, console)
         console.out(NOTE, highlight=False)
 
 
 def _where(comparison: Comparison) -> str:
-    return f"preset {comparison.preset}, {SPLITS[comparison.split]} split"
+    return f"{_place(comparison)}, {SPLITS[comparison.split]} split"
+
+
+def _place(comparison: Comparison) -> str:
+    """The preset, behind the task where that is not the paper's."""
+    of_task = "" if comparison.task == PAPERS_TASK else f"task {comparison.task}, "
+    return f"{of_task}preset {comparison.preset}"
 
 
 def _reservations(comparison: Comparison) -> list[str]:
@@ -103,13 +110,17 @@ def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> No
 
 
 def _tree(comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """A comparison as it is; of several all cells together, which name their preset, and the rest by preset."""
+    """A comparison as it is; of several all cells together, whose rows name what they are of, and the rest by that."""
     trees = [asdict(one) for one in comparisons]
     if len(trees) == 1:
         return trees[0]
     return {"cells": [cell for tree in trees for cell in tree.pop("cells")]} | {
-        "presets": {tree.pop("preset"): tree for tree in trees}
+        "presets": {_key(tree.pop("preset"), tree.pop("task")): tree for tree in trees}
     }
+
+
+def _key(preset: str, task: str) -> str:
+    return preset if task == PAPERS_TASK else f"{preset}, task={task}"
 
 
 def csv_text(kind: Any, rows: Iterable[Any]) -> str:
@@ -122,7 +133,10 @@ def csv_text(kind: Any, rows: Iterable[Any]) -> str:
 
 
 def _overview(comparisons: Sequence[Comparison]) -> Sheet:
-    """The first column of Table 1 at every preset that has one: the paper's methods and what is best beyond them."""
+    """The first column of Table 1 at every preset that has one: the paper's methods and what is best beyond them.
+
+    Of comparisons of the paper's task.
+    """
     none = next(iter(COLLISIONS.values()))
     cells = {
         (cell.row, one.preset): cell

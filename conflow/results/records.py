@@ -115,6 +115,11 @@ class Record:
         return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
 
     @property
+    def chosen(self) -> str:
+        """What `TASK=` was: the task's name, or of one's own that of its file, whose folder no record keeps."""
+        return self.task if self.of_task else f"{self.task}.py"
+
+    @property
     def of_task(self) -> list[str]:
         """The argument that chooses the task, where it is one that has a name here."""
         return [f"task={self.task}"] if self.task in config.names("task") else []
