@@ -91,6 +91,18 @@ def test_the_command_of_a_row_names_the_task(task: str, folder: Path) -> None:
     assert all(command.startswith((again, again.replace("0 1", "0"))) for command in commands)
 
 
+@pytest.mark.parametrize(
+    ("task", "run"), [("social", "social-plus-s$s"), ("my_task.py", "my_task-plus-s$s TASK=my_task.py")]
+)
+def test_the_command_that_samples_a_run_again_brings_the_file_of_its_task(task: str, run: str, folder: Path) -> None:
+    """Which no run holds, so that it is asked for; a task with a name a run knows itself."""
+    (folder / "my_task.py").write_text("x = 1\n")
+    published("plus", 3, 20, f"task={task}")
+    (found,) = comparison.collect_reference()
+    (again,) = {command for command in found.commands.values() if "evaluate" in command}
+    assert again.endswith(f"&& for s in 3; do make evaluate RUN=quick/{run} SPLIT=test ARGS='sample.solver=rk4'; done")
+
+
 def test_a_task_of_ones_own_has_a_column_for_each_setting_and_constraint(folder: Path) -> None:
     """Those without guidance first; the paper has no numbers for it, and its claims are none of it."""
     (folder / "my_task.py").write_text("x = 1\n")

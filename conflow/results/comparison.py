@@ -206,6 +206,7 @@ def _commands(
             seeds = " ".join(str(one.seed) for one in labelled(of_row, label))
             arguments = "" if label == UNCHANGED else f" ARGS='{label.replace(':', '=')}'"
             run = f"{of_row[0].preset}/{of_row[0].name.rpartition('-s')[0]}-s$s"
+            run += "" if of_row[0].of_task else f" TASK={of_row[0].chosen}"  # a file, which no run holds
             evaluated = f"for s in {seeds}; do make evaluate RUN={run} SPLIT={split}{arguments}; done"
             found[f"{name}, {label}"] = f"{again} && {evaluated}"
     if "cgp" in runs:
