@@ -87,7 +87,7 @@ class Planner:
         """The planner of a run: "latest", its id, NAME, PRESET/NAME, or the path of a `model.ckpt`, without a store.
 
         Only weights and plain values are read; no code in the file is executed. So a run on a task of one's own needs
-        the task here too.
+        the task here too; one on a task with a name takes no other.
 
         Raises:
             PlanError: there is no such run or file, the store cannot be used, or the file is damaged or no run's

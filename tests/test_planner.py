@@ -631,6 +631,15 @@ def test_a_checkpoint_plans_as_the_model_that_was_saved(kind: str, tmp_path: Pat
         assert torch.equal(Planner.load(given).plan(START, GOAL, 4, [DISC], VIA).x, expected)
 
 
+def test_a_run_of_a_named_task_takes_no_other(tmp_path: Path) -> None:
+    """As where several runs are drawn, of which some are of a task of one's own: that task is left as it is."""
+    flow, other = planner(), Trio()
+    loaded = Planner.load(save(flow.model, tmp_path / "model.ckpt"), other)
+    assert loaded.model.task.name == "swap"
+    assert torch.equal(loaded.plan(START, GOAL, 3).x, flow.plan(START, GOAL, 3).x)
+    assert "scale" not in vars(other)
+
+
 def test_a_fitted_source_is_conditioned_on_via_points_with_its_own_kernel(tmp_path: Path) -> None:
     model = model_of(fitted(config.load(["preset=smoke", "source.fit=true"]), swap(100)), T, D)
     loaded = Planner.load(save(model, tmp_path / "model.ckpt"))

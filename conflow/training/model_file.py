@@ -25,7 +25,8 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
     Args:
         path: the file.
         arguments: settings `sample....=value` and `seed=value` to sample with in place of the run's own.
-        task: of a run on a task of one's own: the file of a run is not asked which code to run.
+        task: of a run on a task of one's own: the file of a run is not asked which code to run. A run on a task with a
+            name here knows its own, and does not take this one.
 
     Raises:
         ConfigError: an argument that is none of these.
@@ -37,10 +38,11 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
     config = configuration.from_tree(described["config"])
     if arguments:
         config = configuration.override(config, arguments, SAMPLING)
-    if task is None and config.task not in TASKS:
+    if config.task in TASKS:
+        task = build_task(config, described["T"], described["D"])
+    elif task is None:
         expected = f"expected the file or the object of task {config.task_name}, which no checkpoint holds"
         raise MissingTaskError(f"task: {expected}; try: task={Path(config.task).name}")
-    task = task or build_task(config, described["T"], described["D"])
     task.scale, task.offset = described["scale"], described["offset"]
     model = ConFlow(config, task)
     model.load_state_dict(checkpoint["state_dict"])
