@@ -30,7 +30,7 @@ from conflow.training.build import barrier, random_stream
 from conflow.training.config import Range
 from conflow.training.memory import check_memory
 from conflow.training.model import NONE, ConFlow, start_and_goal
-from conflow.training.model_file import MODEL_FILE, MissingTaskError, load_model
+from conflow.training.model_file import MODEL_FILE, TaskError, load_model
 
 ALL, AROUND_OBSTACLES = "all", "obstacle"
 Numbers = ArrayLike | Tensor
@@ -90,8 +90,8 @@ class Planner:
         the task here too; one on a task with a name takes no other.
 
         Raises:
-            PlanError: there is no such run or file, the store cannot be used, or the file is damaged or no run's
-                `model.ckpt`.
+            PlanError: there is no such run or file, the store cannot be used, the file is damaged or no run's
+                `model.ckpt`, or the task is missing or not the run's.
         """
         path = _checkpoint(run)
         try:
@@ -100,7 +100,7 @@ class Planner:
                 return cls(load_model(path, task=task))
         except FileNotFoundError:
             raise PlanError(f"run={run}: no such file, expected the {MODEL_FILE} of a run") from None
-        except MissingTaskError as error:
+        except TaskError as error:
             raise PlanError(f"run={run}: {error}") from None
         except Exception:  # a foreign or damaged file fails in any of a dozen ways, from EOFError to KeyError
             raise PlanError(

@@ -16,6 +16,7 @@ from matplotlib.patches import Circle
 from torch import Tensor
 
 from conflow import __main__ as command_line
+from conflow.errors import ConfigError
 from conflow.figures.plans import picture
 from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
@@ -29,6 +30,7 @@ from conflow.tracking import signals, store
 from conflow.training import config
 from conflow.training.build import fitted, random_stream
 from conflow.training.model import ConFlow
+from conflow.training.model_file import load_model
 from tests.papers import keep_apart, model_of
 
 T, D = 32, 4
@@ -638,6 +640,23 @@ def test_a_run_of_a_named_task_takes_no_other(tmp_path: Path) -> None:
     assert loaded.model.task.name == "swap"
     assert torch.equal(loaded.plan(START, GOAL, 3).x, flow.plan(START, GOAL, 3).x)
     assert "scale" not in vars(other)
+
+
+def test_another_task_than_the_runs_is_refused_in_one_line(tmp_path: Path) -> None:
+    """The file is whole, so it is not called damaged; and the task stays as it was."""
+    model = ConFlow(config.load(["preset=smoke", "task=post.py"]), Post())
+    path = save(model, tmp_path / "model.ckpt")
+    assert Planner.load(path, Post()).model.task.name == "post"
+    other = Trio()
+    with pytest.raises(PlanError) as refused:
+        Planner.load(path, other)
+    found, expected = "found T=16 waypoints of D=6 numbers", "expected T=16 and D=2, as the run of task post has"
+    assert str(refused.value) == f"run={path}: task=trio: {found}, {expected}"
+    assert "scale" not in vars(other)
+    longer = Post()
+    longer.T = 20
+    with pytest.raises(ConfigError, match=r"^task=post: found T=20 waypoints of D=2 numbers, expected T=16 and D=2"):
+        load_model(path, task=longer)
 
 
 def test_a_fitted_source_is_conditioned_on_via_points_with_its_own_kernel(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ MODEL_FILE = "model.ckpt"
 SAMPLING = ("sample.", "seed")
 
 
-class MissingTaskError(ConfigError):
-    """A run on a task of one's own, loaded without it."""
+class TaskError(ConfigError):
+    """A run on a task of one's own, loaded without it or with another."""
 
 
 def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = None) -> ConFlow:
@@ -30,7 +30,7 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
 
     Raises:
         ConfigError: an argument that is none of these.
-        MissingTaskError: the task is none of the program's, and not given.
+        TaskError: the task is none of the program's, and not given, or one of other waypoints or robots.
         CheckpointError: the file is damaged or foreign.
     """
     checkpoint = checkpoint_file.load(path)
@@ -38,11 +38,15 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
     config = configuration.from_tree(described["config"])
     if arguments:
         config = configuration.override(config, arguments, SAMPLING)
+    T, D = described["T"], described["D"]
     if config.task in TASKS:
-        task = build_task(config, described["T"], described["D"])
+        task = build_task(config, T, D)
     elif task is None:
         expected = f"expected the file or the object of task {config.task_name}, which no checkpoint holds"
-        raise MissingTaskError(f"task: {expected}; try: task={Path(config.task).name}")
+        raise TaskError(f"task: {expected}; try: task={Path(config.task).name}")
+    elif task.T != T or task.robots.D != D:
+        expected = f"expected T={T} and D={D}, as the run of task {config.task_name} has"
+        raise TaskError(f"task={task.name}: found T={task.T} waypoints of D={task.robots.D} numbers, {expected}")
     task.scale, task.offset = described["scale"], described["offset"]
     model = ConFlow(config, task)
     model.load_state_dict(checkpoint["state_dict"])
