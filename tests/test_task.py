@@ -133,6 +133,10 @@ class Mine(conflow.Task):
             COMPLETE + "    def constraints_at_inference(self): return self.constraints()\n",
             "expected other names at inference, found walls",
         ),
+        *(
+            (f"{COMPLETE}    offset = {offset}\n", f"offset={offset}: expected a number, or 2, one for each of a")
+            for offset in ("(1.0, 2.0, 3.0)", "[1.0]", "[[1.0, 2.0]]", "[]", "None", "[1.0, None]")
+        ),
         ("import conflow\nTask = conflow.Task\n", "expected one class that is a conflow.Task, found none"),
         ("from conflow.scene.tasks.swap import Swap\n", "expected one class that is a conflow.Task, found none"),
         (COMPLETE + "    def __init__(self, limit): pass\n", "TypeError: "),
@@ -146,6 +150,7 @@ class Mine(conflow.Task):
     ids=[
         *("none", "two", "fails", "syntax", "abstract", "no robots", "no constraint", "unknown constraint"),
         *("setting none", "slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
+        *("long offset", "short offset", "nested offset", "empty offset", "no offset", "half an offset"),
         *("imported base", "imported task", "argument", "fails when made", "import"),
         *("exit", "no robot", "mistyped method", "no text"),
     ],
@@ -186,9 +191,15 @@ class Room:
         COMPLETE,
         COMPLETE + "Alias = Mine\n",
         FUTURE + COMPLETE,
+        COMPLETE + "    offset = 3\n",
+        COMPLETE + "    offset = (3.0, -2)\n",
+        COMPLETE + "    offset = torch.tensor([3.0, -2.0])\n",
         "from conflow.scene.tasks.swap import Swap\n" + COMPLETE,
     ],
-    ids=["plain", "a second name", "a dataclass", "beside an imported task"],
+    ids=[
+        *("plain", "a second name", "a dataclass", "one offset", "an offset each", "a tensor of offsets"),
+        "beside an imported task",
+    ],
 )
 def test_a_file_with_a_task_gives_it(content: str, tmp_path: Path) -> None:
     path = tmp_path / "random.py"  # which must not stand in the way of the standard library's

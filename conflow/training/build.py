@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -86,6 +87,9 @@ def checked(task: Task, name: str) -> Task:
     """
     if not hasattr(task, "robots"):
         raise ConfigError(f"task={name}: expected an attribute robots, such as conflow.Discs(count=1, radius=0.05)")
+    if not _fits(task.offset, task.robots.D):
+        expected = f"expected a number, or {task.robots.D}, one for each of a configuration"
+        raise ConfigError(f"task={name}: offset={brief(task.offset)}: {expected}")
     trained, at_inference = {*task.constraints()}, {*task.constraints_at_inference()}
     known = trained | at_inference
     if not trained:
@@ -105,6 +109,15 @@ def checked(task: Task, name: str) -> Task:
     if "none" in task.settings():
         raise ConfigError(f"task={name}: expected no setting named none, which is that without guidance")
     return task
+
+
+def _fits(offset: Any, D: int) -> bool:
+    """Whether an offset is a number, or D of them."""
+    try:
+        shape = torch.as_tensor(offset, dtype=torch.float32).shape
+    except (TypeError, ValueError, RuntimeError):
+        return False
+    return shape in ((), (D,))
 
 
 def file_of(task: Task) -> str:
