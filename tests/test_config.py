@@ -308,6 +308,17 @@ def test_a_file_is_a_task_that_is_called_as_it(task_file: Path) -> None:
     assert changes(f"task={task_file}") == {"task"}
 
 
+@pytest.mark.parametrize("name", ["social.py", "elsewhere/swap.py"])
+def test_a_file_that_is_called_as_a_named_task_is_to_be_renamed(name: str) -> None:
+    """Runs, records and commands of both would have one name; whether there is such a file does not matter."""
+    task = Path(name).stem
+    with pytest.raises(ConfigError) as refused:
+        config.load([f"task={name}"])
+    expected = f"expected another name than that of the task {task}, for which its runs would be taken"
+    assert str(refused.value) == f"task={name}: {expected}; try: rename the file"
+    assert config.load(["task=my_social.py"]).task_name == "my_social"
+
+
 def test_an_experiment_is_what_its_tasks_file_does_wherever_it_lies(task_file: Path, tmp_path: Path) -> None:
     """Neither a comment nor the folder changes it; a changed number does."""
     sha = config.load([f"task={task_file}"]).sha()

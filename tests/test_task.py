@@ -175,6 +175,13 @@ def test_a_file_that_is_none_is_refused_in_one_line(name: str, tmp_path: Path, m
     assert len(str(refused.value)) < 150
 
 
+def test_a_file_that_is_called_as_a_named_task_is_refused(tmp_path: Path) -> None:
+    """Also where no settings are asked for it, as in drawing a run."""
+    (tmp_path / "swap.py").write_text(COMPLETE)
+    with pytest.raises(ConfigError, match=r"expected another name than that of the task swap, .*rename the file$"):
+        task_of_file(tmp_path / "swap.py")
+
+
 FUTURE = """
 from __future__ import annotations
 from dataclasses import dataclass

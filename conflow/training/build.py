@@ -54,8 +54,9 @@ def task_of_file(path: Path) -> Task:
     """The task that a Python file defines: runs the file, and makes its one subclass of `Task`, without arguments.
 
     Raises:
-        ConfigError: there is no such file, it fails, or it has none or several.
+        ConfigError: there is no such file, it is called as a named task is, it fails, or it has none or several.
     """
+    config.check_file(str(path))
     if not path.is_file():
         raise ConfigError(f"task={brief(path)}: no such file, expected a Python file that defines a Task")
     spec = importlib.util.spec_from_file_location(f"conflow_task_{path.stem}", path)

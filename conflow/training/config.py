@@ -147,6 +147,17 @@ def is_file(task: str) -> bool:
     return task.endswith(".py")
 
 
+def check_file(task: str) -> None:
+    """Refuse a file that is called as a named task is: runs, records and commands of both would have one name.
+
+    Raises:
+        ConfigError: it is.
+    """
+    if is_file(task) and (name := Path(task).stem) in names("task"):
+        expected = f"expected another name than that of the task {name}, for which its runs would be taken"
+        raise ConfigError(f"task={brief(task)}: {expected}; try: rename the file")
+
+
 def names(axis: str) -> list[str]:
     """The tasks, ablations or presets that exist: the files under conf/<axis>/."""
     return sorted(file.stem for file in (CONF / axis).glob("*.yaml"))
@@ -169,6 +180,7 @@ def load(arguments: Sequence[str] = ()) -> Config:
         if name not in names(axis) and not (axis == "task" and is_file(name)):
             known = ", ".join([*names(axis), *(["a file FILE.py"] if axis == "task" else [])])
             raise ConfigError(f"{axis}={brief(name)}: expected one of {known}{nearest(name, names(axis))}")
+    check_file(chosen["task"])
     task = {} if is_file(chosen["task"]) else _read(f"task/{chosen['task']}")
     preset, ablation = (_read(f"{axis}/{chosen[axis]}") for axis in ("preset", "ablation"))
     factors = _factors(f"conf/ablation/{chosen['ablation']}.yaml", ablation.pop("times", {}))
