@@ -362,6 +362,17 @@ def test_pairs_are_the_nearest_or_all() -> None:
         config.load(["constraint.pairs=each"])
 
 
+def test_the_closest_approach_is_of_the_nearest_pair() -> None:
+    """All pairs at all waypoints is the sum, whatever the reduction is called."""
+    expected = "expected sum or mean where constraint.pairs=all, or constraint.pairs=nearest"
+    with pytest.raises(ConfigError) as refused:
+        config.load(["constraint.pairs=all", "constraint.reduction=closest"])
+    assert str(refused.value) == f"constraint.reduction=closest: {expected}"
+    for reduction in ("sum", "mean"):
+        config.load(["constraint.pairs=all", f"constraint.reduction={reduction}"])
+    config.load(["constraint.reduction=closest"])
+
+
 def replaced(key: str, value: Any) -> Any:
     """The tree of the defaults with one value replaced, or without the key where it is ...; dotted keys nest."""
     tree = config.load().tree()
