@@ -323,7 +323,8 @@ class SpeedLimit(Constraint):
     """No body moves faster than `limit`: c = limit - |p_{i+1} - p_i| / dt, in workspace units per second.
 
     At a waypoint the faster of the two steps beside it counts. A trajectory is straight between waypoints, so its speed
-    there is that of the step.
+    there is that of the step: `swept_clearance` of the slower step is above the clearance of the waypoint between them,
+    and the smallest of a trajectory is the same in both.
 
     Args:
         robots: what moves.
