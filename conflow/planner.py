@@ -280,7 +280,10 @@ class Planner:
 
     def _avoidance(self, disc: Obstacle, margin: float = 0.0) -> Constraint:
         """A disc as a constraint with the run's barrier."""
-        return ObstacleAvoidance(self.model.task.robots, [disc]).shaped(barrier(self.model.config), margin)
+        try:
+            return ObstacleAvoidance(self.model.task.robots, [disc]).shaped(barrier(self.model.config), margin)
+        except ValueError as error:
+            raise PlanError(str(error)) from None
 
     def _sample(
         self, arrive: Callable[[Tensor, Tensor], Tensor], y: Tensor, index: Sequence[int], num: int, seed: int

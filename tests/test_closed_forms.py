@@ -455,3 +455,10 @@ def test_one_robot_has_all_constraints_but_that_of_avoiding_others() -> None:
     arm.owner = torch.zeros(4, dtype=torch.long)  # however many bodies it has
     with pytest.raises(ValueError, match="one robot"):
         RobotAvoidance(arm)
+
+
+def test_obstacles_are_one_disc_or_more_for_bodies_in_the_plane() -> None:
+    with pytest.raises(ValueError, match=r"^no obstacles: expected one or more to stay clear of$"):
+        ObstacleAvoidance(THREE, [])
+    with pytest.raises(ValueError, match=r"^obstacles for bodies in 3 dimensions: expected bodies in the plane, as "):
+        ObstacleAvoidance(Balls(2, 0.1), OBSTACLES)

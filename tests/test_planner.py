@@ -32,6 +32,7 @@ from conflow.training.build import fitted, random_stream
 from conflow.training.model import ConFlow
 from conflow.training.model_file import load_model
 from tests.papers import keep_apart, model_of
+from tests.test_closed_forms import Balls
 
 T, D = 32, 4
 START, GOAL = (-0.8, 0.0, 0.8, 0.0), (0.8, 0.0, -0.8, 0.0)
@@ -383,7 +384,7 @@ class Trio(Task):
     """Three robots of which each is larger than the one before."""
 
     T = 16
-    robots = Discs(3, (0.05, 0.1, 0.2))
+    robots: Robots = Discs(3, (0.05, 0.1, 0.2))
 
     def constraints(self) -> dict[str, Constraint]:
         return {"robot": RobotAvoidance(self.robots)}
@@ -415,6 +416,19 @@ def test_of_three_robots_those_that_collide_are_named() -> None:
         PlanError, match=r"start\[1\]=\(-0.8, 0, 0.8, 0, 0.8, 0.2\): violates robot by 0.1 between .* 3,"
     ):
         flow.plan(starts, [TRIO[1]] * 4, 3)
+
+
+class InSpace(Trio):
+    robots = Balls(2, 0.05)
+
+
+def test_discs_are_no_obstacles_of_robots_in_space() -> None:
+    """Which plan all the same without them."""
+    ends = (-0.8, 0, 0, 0.8, 0, 0), (0.8, 0, 0, -0.8, 0, 0)
+    flow = planner_of(InSpace())
+    assert flow.plan(*ends, 3).x.shape == (3, 16, 6)
+    with pytest.raises(PlanError, match=r"^obstacles for bodies in 3 dimensions: expected bodies in the plane"):
+        flow.plan(*ends, 3, obstacles=[(0, 0.5, 0.1)])
 
 
 def test_a_refusal_names_the_robots_whatever_the_barrier_counts() -> None:

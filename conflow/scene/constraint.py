@@ -277,9 +277,17 @@ class ObstacleAvoidance(Avoidance):
     >>> near = ObstacleAvoidance(Discs(1, radius=0.25), [Obstacle(0.0, 1.0, 0.25)])
     >>> near.clearance(torch.zeros(1, 1, 2)).item()
     0.5
+
+    Raises:
+        ValueError: there is no obstacle, or the bodies are in space, where discs are none.
     """
 
     def __init__(self, robots: Robots, obstacles: Sequence[Obstacle]) -> None:
+        if not obstacles:
+            raise ValueError("no obstacles: expected one or more to stay clear of")
+        axes = robots.points(torch.zeros(1, 1, robots.D)).shape[3]
+        if axes != 2:
+            raise ValueError(f"obstacles for bodies in {axes} dimensions: expected bodies in the plane, as discs are")
         bodies, among = len(robots.owner), len(obstacles)
         incidence = torch.eye(bodies).repeat_interleave(among, dim=0)
         offset = torch.tensor([[o.x, o.y] for o in obstacles]).repeat(bodies, 1)
