@@ -14,6 +14,12 @@ from conflow.training.config import Config
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
+# A shell begins what it puts into the background deaf to Ctrl-C, and processes inherit that; tests are about those that
+# hear it.
+for deaf in signals.SIGNALS:
+    if signal.getsignal(deaf) is signal.SIG_IGN:
+        signal.signal(deaf, signal.default_int_handler if deaf == signal.SIGINT else signal.SIG_DFL)
+
 
 @pytest.fixture(scope="session")
 def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
