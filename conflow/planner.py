@@ -6,9 +6,11 @@
 With a `model.ckpt` in place of a run in the store it needs torch and numpy alone.
 """
 
+import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+from itertools import islice
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -19,20 +21,23 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from conflow.errors import ConfigError, brief, nearest
-from conflow.flow.correction import Correction
+from conflow.flow.correction import Correction, descend, descent
 from conflow.flow.sampler import Field, in_pieces, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, ObstacleAvoidance, Sum
 from conflow.scene.measures import leaves_workspace, smoothness
+from conflow.scene.robots import Crowd
 from conflow.scene.settings import Obstacle
 from conflow.scene.task import Task
-from conflow.training.build import barrier, random_stream
+from conflow.training.build import MOMENTUM, barrier, descending, random_stream
 from conflow.training.config import Range
 from conflow.training.memory import check_memory
 from conflow.training.model import NONE, ConFlow, start_and_goal
 from conflow.training.model_file import MODEL_FILE, TaskError, load_model
 
 ALL, AROUND_OBSTACLES = "all", "obstacle"
+CHECKED, ROUNDS = 5, 12
+"""Steps of descent between two looks at candidates, and looks until others are drawn."""
 Numbers = ArrayLike | Tensor
 ViaPoint = tuple[float, Numbers]
 
@@ -119,6 +124,7 @@ class Planner:
         *,
         robot_weight: float | None = None,
         obstacle_weight: float | None = None,
+        descent: int | None = None,
     ) -> Plans:
         """`num` trajectories x_1 for every pair of start and goal.
 
@@ -145,10 +151,17 @@ class Planner:
             seed: of the noise.
             robot_weight: lambda_r, where guidance uses it; the run's `sample.robot_weight` unless given.
             obstacle_weight: lambda_o, likewise.
+            descent: steps of descent after the flow, around all that is to be kept; the run's `sample.descent` unless
+                given. Trajectories that keep it with the run's margin stay as they are.
 
         Raises:
             PlanError: names the argument, its value and what was expected.
         """
+        sized = self._sized(start)
+        if sized is not self:
+            weights = {"robot_weight": robot_weight, "obstacle_weight": obstacle_weight}
+            return sized.plan(start, goal, num, obstacles, via, guidance, seed, descent=descent, **weights)
+        steps = self.model.config.sample.descent if descent is None else _whole("descent", descent, low=0)
         num, seed = _whole("num", num, low=1), _whole("seed", seed, low=0)
         start, goal = self._configurations("start", start), self._configurations("goal", goal)
         if goal.shape != start.shape:
@@ -176,9 +189,80 @@ class Planner:
 
         index = (0, *points, -1)
         x = self._sample(arrive, self._inside(y), index, num, seed)
+        if steps:
+            u_c = self._descending(discs, index)
+            x = in_pieces(lambda x: descend(x, u_c, steps, MOMENTUM), x.flatten(0, 1)).view_as(x)
         plans = self._in_users_units(_ranked(x, Sum(list(met.values()))))
         plans.x[:, :, index] = y[:, None]  # which on the way through workspace units may have lost a bit
         return plans if start.ndim == 2 else plans[0]
+
+    def best_of(
+        self,
+        start: Numbers,
+        goal: Numbers,
+        num: int = 16,
+        obstacles: Sequence[Obstacle | Sequence[float]] = (),
+        seed: int = 0,
+        *,
+        seconds: float = 10.0,
+        progress: Callable[[float, float], None] | None = None,
+    ) -> Plans:
+        """One feasible plan for a single pair, as soon as there is one: `num` candidates at a time, descending.
+
+        Every CHECKED steps of descent the candidates are judged. After ROUNDS checks others are drawn, with the next
+        seed.
+
+        Args:
+            start: configuration (D,), in the user's units.
+            goal: likewise.
+            num: candidates at a time.
+            obstacles: as in `plan`.
+            seed: of the noise.
+            seconds: after which the best there is, feasible or not, is returned.
+            progress: called after every check with the seconds so far and the best clearance.
+
+        Raises:
+            PlanError: as `plan`.
+        """
+        sized, began, best = self._sized(start), time.monotonic(), None
+        discs = [sized._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
+        met = Sum([*sized._kept(), *map(sized._avoidance, discs)])
+        index = (0, -1)
+        u_c = sized._descending(discs, index)
+        while True:
+            plans = sized.plan(start, goal, num, obstacles, seed=seed, descent=0)
+            states = descent(sized.to_workspace(plans.x), u_c, MOMENTUM)
+            for x in islice(states, 0, CHECKED * ROUNDS, CHECKED):
+                found = _ranked(x[None], met)[0]
+                one = Plans(*(getattr(found, field.name)[:1] for field in fields(found)))
+                if best is None or (bool(one.feasible), float(one.clearance)) > (
+                    bool(best.feasible),
+                    float(best.clearance),
+                ):
+                    best = one
+                if progress:
+                    progress(time.monotonic() - began, sized.scale * float(best.clearance))
+                if bool(best.feasible) or time.monotonic() - began > seconds:
+                    return sized._in_users_units(best)
+            seed += 1
+
+    def _sized(self, start: Numbers) -> "Planner":
+        """The planner for as many robots as a start (..., D) places: this one, unless its robots are a crowd."""
+        if not isinstance(self.model.task.robots, Crowd):
+            return self
+        D = _numbers("start", start, "numbers of shape (D,) or (B, D)").shape[-1:]
+        known = D in ((), (self.model.D,)) or D[0] < 4 or D[0] % 2
+        return self if known else Planner(self.model.of_numbers(D[0]))
+
+    def _kept(self) -> list[Constraint]:
+        """What training keeps, as plans are judged."""
+        return [self.model.judged[name] for name in self.model.task.constraints()]
+
+    def _descending(self, discs: Sequence[Obstacle], index: Sequence[int]) -> Correction:
+        """The correction that descent follows: of all that training keeps and of obstacles, at rest at waypoints O."""
+        task, config = self.model.task, self.model.config
+        around = [ObstacleAvoidance(task.robots, [disc]) for disc in discs]
+        return descending(config, task, self.model.source.condition(index), around)
 
     def _in_users_units(self, plans: Plans) -> Plans:
         x = plans.x if self._in_workspace_units() else self.scale * plans.x + self.offset

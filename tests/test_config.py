@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from conflow.errors import ConfigError
-from conflow.scene.tasks import TASKS
+from conflow.scene.tasks import SWAPS, TASKS
 from conflow.training import config
 from conflow.training.config import CONF, OF_SWAPS, SIZES
 from tests.test_layout import loaded
@@ -200,7 +200,12 @@ def test_the_accelerator_is_no_part_of_what_an_experiment_is() -> None:
     assert here.train != there.train
     assert here.sha() == there.sha()
     assert "train.accelerator" not in config.flatten(here.identity())
-    assert config.flatten(here.tree()).keys() - config.flatten(here.identity()).keys() == {"train.accelerator"}
+    assert config.flatten(here.tree()).keys() - config.flatten(here.identity()).keys() == {
+        "train.accelerator",
+        "sample.descent",
+    }
+    refined = config.load(["sample.descent=5"])  # which came later, and is none by default
+    assert config.flatten(refined.identity())["sample.descent"] == 5
 
 
 @pytest.mark.parametrize(
@@ -256,7 +261,6 @@ def test_fitting_the_standard_normal_is_refused() -> None:
     [
         (["correction.at=end", "correction.path=guided"], "correction.path=guided: expected correction.at=point"),
         (["data.negative_share=0.1", "data.negatives=false"], "data.negative_share=0.1: expected data.negatives=true"),
-        (["data.repair=true", "data.negatives=false"], "data.repair=True: expected data.negatives=true"),
         (["data.repair=true"], "correction.margin=0.0: expected a number above 0 where data.repair=true"),
         (["source.kind=gaussian", "network.kind=spectral"], "source.kind=gaussian: expected gp or cgp"),
         (["source.kind=gaussian", "correction.smoothing=covariant"], "source.kind=gaussian: expected gp or cgp"),
@@ -271,7 +275,7 @@ def test_settings_that_contradict_each_other_are_refused(arguments: list[str], s
 @pytest.mark.parametrize("task", config.names("task"))
 def test_a_task_is_chosen_by_its_name_and_says_how_many_demonstrations_it_has(task: str) -> None:
     assert task in TASKS
-    assert changes(f"task={task}") - {"task"} <= {"data.num"}
+    assert task not in config.SWAPS or changes(f"task={task}") - {"task"} <= {"data.num"}
     settings = config.load([f"task={task}", "ablation=fm", "seed=3"])
     assert (settings.task, settings.task_name) == (task, task)
     assert settings.name == ("fm-s3" if task == "swap" else f"{task}-fm-s3")
@@ -287,7 +291,8 @@ def test_presets_and_arguments_win_over_tasks() -> None:
 def test_a_task_that_there_is_not_is_refused_with_the_names_of_all(task: str) -> None:
     with pytest.raises(ConfigError) as refused:
         config.load([f"task={task}"])
-    assert str(refused.value).startswith(f"task={task}: expected one of passing, social, swap, a file FILE.py")
+    known = ", ".join(config.names("task"))
+    assert str(refused.value).startswith(f"task={task}: expected one of {known}, a file FILE.py")
     assert ("did you mean passing?" in str(refused.value)) == (task == "pasing")
 
 
@@ -338,13 +343,55 @@ def test_an_experiment_is_what_its_tasks_file_does_wherever_it_lies(task_file: P
         *("sample.obstacle.x=0.2", "sample.obstacle.radius=0.2", "sample.radius=0.25"),
     ],
 )
-def test_settings_of_swaps_are_refused_for_a_task_of_a_file(argument: str, task_file: Path) -> None:
-    """Which would have no effect there: its file says what they do."""
+def test_settings_of_swaps_are_refused_for_other_tasks(argument: str, task_file: Path) -> None:
+    """Which would have no effect there: a file says what they do, and a crowd has settings of its own."""
     assert argument.startswith(OF_SWAPS)
-    with pytest.raises(ConfigError) as refused:
-        config.load([f"task={task_file}", argument])
-    assert str(refused.value) == f"{argument}: expected one of the tasks passing, social, swap, which it belongs to"
+    for task in (task_file, "weave"):
+        with pytest.raises(ConfigError) as refused:
+            config.load([f"task={task}", argument])
+        assert str(refused.value) == f"{argument}: expected one of the tasks passing, social, swap, which it belongs to"
     config.load(["task=passing", argument])
+
+
+def test_the_tasks_of_two_robots_that_swap_sides_are_those_of_the_scene() -> None:
+    assert set(config.SWAPS) == SWAPS.keys()
+    assert TASKS.keys() == set(config.names("task"))
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [
+        ("task.robots=[10, 20,28]", [10, 20, 28]),
+        ("task.robots=3", 3),
+        ("task.radius=5e-2", "5e-2"),
+        ("task.radius=0.05", 0.05),
+        ("task.closed=true", True),
+        ("task.label=a b${c}", "a b${c}"),
+        ("task.limit=null", None),
+    ],
+)
+def test_what_a_task_is_made_with_stands_beside_its_name(argument: str, value: object) -> None:
+    """It goes through checkpoints, belongs to what the experiment is, and is not touched by OmegaConf."""
+    settings = config.load(["task=weave", argument])
+    name = argument.partition("=")[0]
+    assert settings.of_task == {name.removeprefix("task."): value}
+    assert settings.tree()[name] == value
+    assert config.from_tree(settings.tree()) == settings
+    assert settings.sha() != config.load(["task=weave"]).sha()
+    assert config.override(settings, ["sample.steps=3"], ["sample."]).of_task == settings.of_task
+
+
+def test_a_list_of_a_task_is_of_numbers() -> None:
+    for argument in ("task.robots=[a, b]", f"task.robots={[1] * 65}"):
+        with pytest.raises(ConfigError, match=r"expected \[a, b, \.\.\.\] of at most 64 numbers"):
+            config.load(["task=weave", argument])
+
+
+def test_the_lengths_of_a_task_and_of_an_ablation_both_multiply_those_of_the_preset() -> None:
+    plain = config.load(["preset=long"])
+    crowd = config.load(["preset=long", "task=weave", "ablation=plus"])
+    assert crowd.train.max_steps == round(round(plain.train.max_steps * 2.25) * 0.4)
+    assert crowd.train.batch_size == plain.train.batch_size / 16
 
 
 def test_every_setting_of_swaps_is_one_and_all_others_are_taken(task_file: Path) -> None:

@@ -1,5 +1,6 @@
 """The smoothed correction u^c: the Gaussian filter against SciPy's, the covariant one, and repair by it."""
 
+from itertools import islice
 from typing import get_args
 
 import pytest
@@ -8,9 +9,10 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from conflow.flow import source
-from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
+from conflow.flow.correction import Correction, covariant, descend, descent, gaussian_filter
 from conflow.flow.settings import Edges
 from conflow.scene.constraint import Barrier, Constraint
+from conflow.scene.settings import BarrierShape
 from conflow.scene.tasks.swap import swap
 from tests.papers import keep_apart
 
@@ -26,6 +28,9 @@ class Quadratic:
 
     def gradient(self, x: Tensor) -> Tensor:
         return x
+
+    def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.barrier(x), self.gradient(x)
 
 
 widths = pytest.mark.parametrize(("T", "sigma", "width"), [(32, 5.0, 9), (32, 0.7, 4), (5, 2.0, 3), (3, 5.0, 9)])
@@ -134,12 +139,13 @@ def test_lambda_means_the_same_for_every_number_of_waypoints_and_length_scale(T:
     assert clearing_time(T, length_scale) == pytest.approx(clearing_time(32, 0.4), rel=0.15)
 
 
-def test_repair_moves_every_collision_out_and_nothing_else() -> None:
+@pytest.mark.parametrize(("shape", "momentum"), [("relu", 0.0), ("square", 0.7)])
+def test_descent_moves_every_collision_out_and_nothing_else(shape: BarrierShape, momentum: float) -> None:
     """The gradient flow of the covariant correction, with start and goal fixed to the last bit."""
     x = swap(2000)
-    u_c = Correction(robots(0.06, Barrier("relu")), covariant(cgp().covariance))
-    again = repair(x, u_c)
-    assert not robots(0.059).violation(again).any()
+    u_c = Correction(robots(0.06, Barrier(shape)), covariant(cgp().covariance))
+    again = descend(x, u_c, 100, momentum)
+    assert not robots(0.058).violation(again).any()
     assert torch.equal(again[:, [0, -1]], x[:, [0, -1]])
     untouched = ~robots(0.06).violation(x)
     assert torch.equal(again[untouched], x[untouched])
@@ -147,7 +153,15 @@ def test_repair_moves_every_collision_out_and_nothing_else() -> None:
     assert (again - x)[~untouched].abs().amax(dim=(1, 2)).median() < 0.25
 
 
-def test_one_step_of_repair_solves_a_linear_constraint() -> None:
+def test_the_states_of_descent_begin_with_what_is_given_and_end_where_it_arrives() -> None:
+    x, u_c = swap(20), Correction(robots(0.06, Barrier("square")), covariant(cgp().covariance))
+    states = list(islice(descent(x, u_c, 0.7), 6))
+    assert torch.equal(states[0], x)
+    assert torch.equal(states[5], descend(x, u_c, 5, 0.7))
+    assert torch.equal(descend(x, u_c, 0, 0.7), x)
+
+
+def test_one_step_of_descent_solves_a_linear_constraint() -> None:
     """C = <n, x> - b where negative: one Newton step lands on C = 0, moved along S n."""
     n = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
 
@@ -160,7 +174,7 @@ def test_one_step_of_repair_solves_a_linear_constraint() -> None:
 
     S = gaussian_filter(5, 2.0, 3)
     x = torch.zeros(1, 5, 2)
-    moved = repair(x, Correction(Halfspace(), S), steps=1)
+    moved = descend(x, Correction(Halfspace(), S), steps=1)
     assert (n * moved).sum().item() == pytest.approx(1, abs=1e-6)
     torch.testing.assert_close(moved[0] / moved.norm(), (S.float() @ n) / (S.float() @ n).norm())
 
@@ -168,4 +182,4 @@ def test_one_step_of_repair_solves_a_linear_constraint() -> None:
 def test_what_cannot_be_repaired_stays_as_it_is() -> None:
     """Two robots on one path have no direction in which to part."""
     x = torch.linspace(-0.5, 0.5, 32)[None, :, None].expand(1, 32, 4).contiguous()
-    assert torch.equal(repair(x, Correction(robots(0.06, Barrier("relu")), covariant(cgp().covariance))), x)
+    assert torch.equal(descend(x, Correction(robots(0.06, Barrier("relu")), covariant(cgp().covariance)), 100), x)

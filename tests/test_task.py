@@ -3,7 +3,9 @@
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -17,6 +19,7 @@ from conflow.scene.tasks import TASKS
 from conflow.scene.tasks.swap import Swap
 from conflow.training import config
 from conflow.training.build import build_task, file_of, task_of_file
+from conflow.training.module import Training
 
 
 class Moving(Task):
@@ -137,6 +140,11 @@ class Mine(conflow.Task):
             (f"{COMPLETE}    offset = {offset}\n", f"offset={offset}: expected a number, or 2, one for each of a")
             for offset in ("(1.0, 2.0, 3.0)", "[1.0]", "[[1.0, 2.0]]", "[]", "None", "[1.0, None]")
         ),
+        (
+            "from conflow.scene import constraint\n"
+            + COMPLETE.replace("conflow.Workspace", "constraint.RobotAvoidance"),
+            "ValueError: one robot: expected two or more",
+        ),
         ("import conflow\nTask = conflow.Task\n", "expected one class that is a conflow.Task, found none"),
         ("from conflow.scene.tasks.swap import Swap\n", "expected one class that is a conflow.Task, found none"),
         (COMPLETE + "    def __init__(self, limit): pass\n", "TypeError: "),
@@ -151,6 +159,7 @@ class Mine(conflow.Task):
         *("none", "two", "fails", "syntax", "abstract", "no robots", "no constraint", "unknown constraint"),
         *("setting none", "slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
         *("long offset", "short offset", "nested offset", "empty offset", "no offset", "half an offset"),
+        "broken constraints",
         *("imported base", "imported task", "argument", "fails when made", "import"),
         *("exit", "no robot", "mistyped method", "no text"),
     ],
@@ -209,12 +218,36 @@ class Room:
     ],
 )
 def test_a_file_with_a_task_gives_it(content: str, tmp_path: Path) -> None:
-    path = tmp_path / "random.py"  # which must not stand in the way of the standard library's
+    path = tmp_path / "secrets.py"  # which must not stand in the way of the standard library's
     path.write_text(content)
     task = task_of_file(path)
     assert (task.name, task.robots.count, list(task.constraints())) == ("mine", 1, ["walls"])
     assert file_of(task) == str(path)
-    assert "random" not in sys.modules or sys.modules["random"].__file__ != str(path)
+    assert "secrets" not in sys.modules or sys.modules["secrets"].__file__ != str(path)
+
+
+def test_a_file_s_task_is_made_with_settings_of_its_own(tmp_path: Path) -> None:
+    """Those that its constructor names; they belong to what the experiment is."""
+    path = tmp_path / "mine.py"
+    path.write_text(COMPLETE + "    def __init__(self, width: float = 1.0, label='a'): self.width = width\n")
+    settings = config.load([f"task={path}", "task.width=2"])
+    task = build_task(settings)
+    assert (task.name, vars(task)) == ("mine", {"width": 2})
+    assert settings.sha() != config.load([f"task={path}"]).sha()
+    with pytest.raises(ConfigError, match=r"^task\.widht=2: no such setting of task mine, expected one of width, lab"):
+        build_task(config.load([f"task={path}", "task.widht=2"]))
+
+
+@pytest.mark.parametrize("offset", [np.float32(3), np.array([3.0, -2.0]), torch.tensor([3.0, -2.0]), (3, -2.0), 3])
+def test_a_checkpoint_holds_an_offset_of_any_kind_as_plain_numbers(offset: Any, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(COMPLETE)
+    settings = config.load([f"task={tmp_path / 'mine.py'}", "ablation=plus", "preset=smoke"])
+    task = build_task(settings)
+    task.offset, checkpoint = offset, {"conflow": None}
+    Training(settings, task).on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    loaded = torch.load(tmp_path / "model.ckpt", weights_only=True)["conflow"]
+    assert loaded["offset"] == ([3.0, -2.0] if np.ndim(offset) else 3.0)
 
 
 def test_a_changed_file_gives_the_changed_task(tmp_path: Path) -> None:

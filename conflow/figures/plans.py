@@ -7,8 +7,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above, standing
+from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, rounded, seen_from_above, standing
 from conflow.planner import Planner, Plans
+from conflow.scene.settings import Box
 
 PER_ROW = 3
 """Entries of the legend in a row; more would be cut off."""
@@ -45,6 +46,10 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
         [*(planner.scale * torch.tensor(place) + planner.offset[:2]), planner.scale * radius]
         for *place, radius in standing(task)
     ]
+    for box in task.boxes():
+        x, y = (planner.scale * torch.tensor([box.x, box.y]) + planner.offset[:2]).tolist()
+        sizes = (planner.scale * size for size in (box.width, box.height, box.rounding))
+        axis.add_patch(rounded(Box(x, y, *sizes)))
     for x, y, radius in [*obstacles, *always]:
         axis.add_patch(Circle((x, y), radius, color=OBSTACLE, zorder=2.5))
     handles, labels = axis.get_legend_handles_labels()

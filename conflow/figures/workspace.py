@@ -8,18 +8,19 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, FancyBboxPatch, Rectangle
 from torch import Tensor
 
 from conflow.flow.sampler import states
 from conflow.scene.constraint import Constraint, Sum
 from conflow.scene.robots import Robots
+from conflow.scene.settings import Box
 from conflow.scene.task import Task
 from conflow.training.build import joined, labels
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import Evaluation
-from conflow.training.model import NONE, ConFlow
+from conflow.training.model import NONE, REFINED, ConFlow
 
 # Okabe and Ito's palette.
 ROBOTS = ("#0072B2", "#009E73", "#CC79A7", "#56B4E9")
@@ -28,6 +29,8 @@ OBSTACLE = "#999999"
 OF_TRAINING = ("page", "demonstrations", "sources")
 """The pictures that training draws and logs."""
 SHOWN = 60
+NAMED = 6
+"""Robots that a legend can name."""
 DPI = 110
 HAIR = 1e-5
 TIMES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -35,6 +38,8 @@ TIMES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 def titled(setting: str) -> str:
     """What a panel of a setting is called."""
+    if setting == REFINED:
+        return "guided, then descended"
     return "generated, no guidance" if setting == NONE else f"guided around {setting}"
 
 
@@ -193,16 +198,24 @@ def _share(violates: Tensor) -> str:
 
 def _trajectories(axis: Axes, x: Tensor, violates: Tensor, constraint: Constraint) -> None:
     """The first trajectories, each robot's in its colour; those in violation on top, marked at the closest approach."""
-    x, violates, robots = x[:SHOWN], violates[:SHOWN], constraint.robots
+    robots = constraint.robots
+    x, violates = x[: shown(robots)], violates[: shown(robots)]
     paths = seen_from_above(robots, x)
     for body, robot in enumerate(robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]
         axis.add_collection(LineCollection(list(paths[~violates, :, body].numpy()), colors=colour, alpha=0.4, lw=0.9))
-        axis.add_collection(LineCollection(list(paths[violates, :, body].numpy()), colors=COLLISION, alpha=0.9, lw=0.9))
+        # Of a crowd who goes where is more to see than that somebody collides, which the crosses show.
+        wrong = COLLISION if robots.count <= NAMED else colour
+        axis.add_collection(LineCollection(list(paths[violates, :, body].numpy()), colors=wrong, alpha=0.9, lw=0.9))
         starts = paths[:, 0, body]
         axis.scatter(starts[:, 0], starts[:, 1], s=6, color=colour, zorder=3)
     contacts = _contacts(x, constraint)[violates]
     axis.scatter(contacts[:, 0], contacts[:, 1], marker="x", s=22, color="black", linewidth=0.9, zorder=4)
+
+
+def shown(robots: Robots) -> int:
+    """How many trajectories are drawn: fewer of many robots."""
+    return max(1, min(SHOWN, 4 * SHOWN // robots.count**2))
 
 
 def seen_from_above(robots: Robots, x: Tensor) -> Tensor:
@@ -252,6 +265,16 @@ def standing(task: Task) -> Sequence[tuple[float, float, float]]:
 def _standing(axes: Sequence[Axes], task: Task) -> None:
     for axis in axes:
         _obstacles(axis, standing(task), task.robots)
+        for box in task.boxes():
+            axis.add_patch(rounded(box))
+
+
+def rounded(box: Box) -> FancyBboxPatch:
+    """A box of a map."""
+    inner = (box.x - box.width / 2 + box.rounding, box.y - box.height / 2 + box.rounding)
+    size = (max(box.width - 2 * box.rounding, 1e-6), max(box.height - 2 * box.rounding, 1e-6))
+    style = f"round,pad={box.rounding},rounding_size={box.rounding}" if box.rounding else "square,pad=0"
+    return FancyBboxPatch(inner, *size, boxstyle=style, color=OBSTACLE, lw=0, zorder=0.5)
 
 
 def _obstacles(axis: Axes, obstacles: Sequence[tuple[float, float, float]], robots: Robots) -> None:
@@ -263,15 +286,16 @@ def _obstacles(axis: Axes, obstacles: Sequence[tuple[float, float, float]], robo
 
 
 def _legend(figure: Figure, robots: Robots) -> None:
-    handles = [Line2D([], [], color=ROBOTS[i % len(ROBOTS)], label=f"robot {i + 1}") for i in range(robots.count)]
+    named = robots.count if robots.count <= NAMED else 0
+    handles = [Line2D([], [], color=ROBOTS[i % len(ROBOTS)], label=f"robot {i + 1}") for i in range(named)]
     handles.append(
         Line2D(
             [],
             [],
-            color=COLLISION,
+            color=COLLISION if named else "none",
             marker="x",
             markeredgecolor="black",
-            label=f"in collision, crossed where closest (first {SHOWN} drawn)",
+            label=f"in collision, crossed where closest (first {shown(robots)} drawn)",
         )
     )
     # The last column has the long entry, beside as many of the robots' as there is room for.

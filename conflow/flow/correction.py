@@ -1,5 +1,7 @@
 """The constraint-induced correction u^c of the velocity (paper: "Constraint-Guided Objective", appendix)."""
 
+from collections.abc import Iterator
+from itertools import islice
 from typing import Protocol
 
 import torch
@@ -22,6 +24,10 @@ class Differentiable(Protocol):
 
     def gradient(self, x: Tensor) -> Tensor:
         """grad C at x, both (batch, T, D)."""
+        ...
+
+    def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """C and grad C."""
         ...
 
 
@@ -81,16 +87,26 @@ def covariant(Sigma: Tensor) -> Tensor:
     return Sigma.double() / Sigma.double().abs().sum(dim=1).max()
 
 
-def repair(x: Tensor, u_c: Correction, steps: int = 100) -> Tensor:
-    """Trajectories x (batch, T, D) moved out of collision by the gradient flow of the correction S grad C.
+def descent(x: Tensor, u_c: Correction, momentum: float = 0.0) -> Iterator[Tensor]:
+    """The states x_0 = x, x_1, ... of trajectories (batch, T, D) under descent along the correction S grad C, for ever.
 
-    Newton's steps on C(x) = 0 in the metric of S, x <- x - C / <grad C, S grad C> S grad C: each is the least
-    displacement, as measured by S^-1, that solves the linearised equation. For a barrier that is 0 where feasible.
-    What does not move, such as two bodies that share their whole path, stays as it is.
+    Newton's steps on C(x) = 0 in the metric of S, with what is left of the step before it:
+    V <- momentum V - C / <grad C, S grad C> S grad C, x <- x + V. Each Newton step is the least displacement, as
+    measured by S^-1, that solves the linearised equation, so there is no length to choose. For a barrier that is 0
+    where feasible. What does not move, such as two bodies that share their whole path, stays as it is, and so does what
+    is feasible.
     """
-    for _ in range(steps):
-        C, g = u_c.constraint.barrier(x), u_c.constraint.gradient(x)
+    V = torch.zeros_like(x)
+    while True:
+        yield x
+        C, g = u_c.constraint.barrier_and_gradient(x)
         moving = (u_c.smoothing @ g) * (C < 0)[:, None, None]
         slope = (g * moving).sum(dim=(1, 2))
-        x = x + torch.where(slope > 0, -C / slope.clamp_min(torch.finfo(x.dtype).tiny), 0)[:, None, None] * moving
-    return x
+        step = torch.where(slope > 0, -C / slope.clamp_min(torch.finfo(x.dtype).tiny), 0)[:, None, None] * moving
+        V = momentum * V * (C < 0)[:, None, None] + step
+        x = x + V
+
+
+def descend(x: Tensor, u_c: Correction, steps: int, momentum: float = 0.0) -> Tensor:
+    """Where `descent` has come after so many steps, (batch, T, D); with a relu barrier it repairs demonstrations."""
+    return next(islice(descent(x, u_c, momentum), steps, None))

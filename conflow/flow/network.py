@@ -1,5 +1,7 @@
 """The velocity networks v_theta: the paper's (appendix: "Architecture and training details"), and a spectral one."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor, nn
 
@@ -51,7 +53,7 @@ class ResMLP(nn.Module):
         return self.outlet(self.blocks(h)).view_as(x)
 
 
-class SpectralMLP(nn.Module):
+class Spectral(nn.Module, ABC):
     """v_theta in the eigenvectors E of the source's Sigma: v(x, t) = E (a(t) z + c(t) h_theta), z = E^T (x - W x_O).
 
     Each mode has a variance sigma_0^2 under the source, its eigenvalue, and sigma_1^2 among the demonstrations. Were
@@ -66,10 +68,8 @@ class SpectralMLP(nn.Module):
 
     Args:
         source: its modes, usually a few leading ones.
-        D: dimensions of a trajectory.
+        D: the dimensions that have variances of their own; 1 where all have the same.
         constraint: gives clearance and grad C.
-        hidden: width.
-        blocks: residual blocks.
         frequencies: of the features sin(k pi t), cos(k pi t).
     """
 
@@ -79,20 +79,12 @@ class SpectralMLP(nn.Module):
     source_variance: Tensor
     variance: Tensor
     frequencies: Tensor
+    outlet: nn.Linear
 
-    def __init__(
-        self,
-        source: Source,
-        D: int,
-        constraint: Differentiable,
-        hidden: int = 256,
-        blocks: int = 4,
-        frequencies: int = 8,
-    ) -> None:
+    def __init__(self, source: Source, D: int, constraint: Differentiable, frequencies: int = 8) -> None:
         super().__init__()
         self.constraint = constraint
-        (T, m), observations = source.modes.shape, len(source.index)
-        dtype = torch.get_default_dtype()
+        m, dtype = source.modes.shape[1], torch.get_default_dtype()
         self.register_buffer("observed", source.index, persistent=False)
         self.register_buffer("mean_map", source.mean_map.to(dtype), persistent=False)
         self.register_buffer("modes", source.modes.to(dtype), persistent=False)
@@ -100,15 +92,13 @@ class SpectralMLP(nn.Module):
         # Of the demonstrations, so a checkpoint has to hold it.
         self.register_buffer("variance", self.source_variance.clone())
         self.register_buffer("frequencies", torch.pi * torch.arange(1, frequencies + 1), persistent=False)
-        self.inlet = nn.Linear(2 * m * D + observations * D + 1 + 2 * frequencies + T, hidden)
-        self.blocks = nn.Sequential(*(ResidualBlock(hidden) for _ in range(blocks)))
-        self.outlet = nn.Linear(hidden, m * D)
-        nn.init.zeros_(self.outlet.weight)  # training starts from the Gaussian flow
-        nn.init.zeros_(self.outlet.bias)
 
     def fit(self, x_1: Tensor) -> None:
         """Set sigma_1^2 to the second moments of demonstrations x_1 (N, T, D) about W x_O, at least rounding's size."""
-        self.variance = self.coordinates(x_1).square().mean(dim=0).clamp_min(torch.finfo(x_1.dtype).eps)
+        squares = self.coordinates(x_1).square().mean(dim=0)
+        if self.variance.shape[1] == 1:
+            squares = squares.mean(dim=1, keepdim=True)
+        self.variance = squares.clamp_min(torch.finfo(x_1.dtype).eps)
 
     def coordinates(self, x: Tensor) -> Tensor:
         """z = E^T (x - W x_O), (batch, m, D)."""
@@ -131,13 +121,50 @@ class SpectralMLP(nn.Module):
         sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
         a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2
         c = (self.source_variance * self.variance).sqrt() / sigma_t
-        h = self.outlet(self.blocks(self.inlet(self._features(x, (z / sigma_t).clamp(-SEEN, SEEN), t))))
-        return self.modes @ (a * z + c * h.view_as(z))
+        return self.modes @ (a * z + c * self.rest(x, (z / sigma_t).clamp(-SEEN, SEEN), t))
 
-    def _features(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
+    @abstractmethod
+    def rest(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
+        """h_theta at x (batch, T, D), z / sigma_t (batch, m, D) and t (batch,), (batch, m, D)."""
+
+    def clock(self, t: Tensor) -> list[Tensor]:
+        """t and its Fourier features, (batch, ...) each."""
         angles = t[:, None] * self.frequencies
-        # Modes as wide as the source is in them; of the clearances only the near ones matter.
-        pushed = (self.source_variance / self.source_variance[0]).sqrt() * (self.modes.mT @ self.constraint.gradient(x))
-        near = 4 * self.constraint.clearance(x).clamp(max=1)
-        values = [z.flatten(1), x[:, self.observed].flatten(1), t[:, None], angles.sin(), angles.cos()]
-        return torch.cat([*values, near, pushed.flatten(1)], dim=1)
+        return [t[:, None], angles.sin(), angles.cos()]
+
+    def pushed(self, x: Tensor) -> Tensor:
+        """grad C in the modes, each as wide as the source is in it, (batch, m, D)."""
+        return (self.source_variance / self.source_variance[0]).sqrt() * (self.modes.mT @ self.constraint.gradient(x))
+
+
+class SpectralMLP(Spectral):
+    """The residual MLP as h_theta, for robots whose number never changes.
+
+    Args:
+        source, D, constraint, frequencies: of `Spectral`.
+        hidden: width.
+        blocks: residual blocks.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        D: int,
+        constraint: Differentiable,
+        hidden: int = 256,
+        blocks: int = 4,
+        frequencies: int = 8,
+    ) -> None:
+        super().__init__(source, D, constraint, frequencies)
+        (T, m), observations = source.modes.shape, len(source.index)
+        self.inlet = nn.Linear(2 * m * D + observations * D + 1 + 2 * frequencies + T, hidden)
+        self.blocks = nn.Sequential(*(ResidualBlock(hidden) for _ in range(blocks)))
+        self.outlet = nn.Linear(hidden, m * D)
+        nn.init.zeros_(self.outlet.weight)  # training starts from the Gaussian flow
+        nn.init.zeros_(self.outlet.bias)
+
+    def rest(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
+        pushed = self.pushed(x)
+        near = 4 * self.constraint.clearance(x).clamp(max=1)  # only the near ones matter
+        values = [z.flatten(1), x[:, self.observed].flatten(1), *self.clock(t), near, pushed.flatten(1)]
+        return self.outlet(self.blocks(self.inlet(torch.cat(values, dim=1)))).view_as(z)

@@ -14,6 +14,8 @@ Field = Callable[[Tensor, Tensor], Tensor]
 
 PIECE = 2048
 """Trajectories that a network sees at a time, the same on every machine: a matrix product's bits vary with its size."""
+NUMBERS = 4 * PIECE
+"""Rows times numbers of a configuration in a piece at most: what pairs of robots need grows with its square."""
 
 Push = Callable[[Tensor], Tensor]
 """lambda u^c: where a trajectory x (batch, T, D) should move, with its weight; of several constraints the sum."""
@@ -117,8 +119,9 @@ def integrate(v: Field, x_0: Tensor, steps: int = 250, solver: Solver = "euler")
 
 
 def in_pieces(f: Callable[..., Tensor], *batches: Tensor) -> Tensor:
-    """f(*batches), row by row a function of its arguments (batch, ...), for PIECE rows at a time.
+    """f(*batches), row by row a function of its arguments (batch, ..., D): PIECE rows at a time, or fewer of large D.
 
     What f needs beside its result, such as a network's activations, does not grow with the batch then.
     """
-    return torch.cat([f(*piece) for piece in zip(*(batch.split(PIECE) for batch in batches), strict=True)])
+    rows = min(PIECE, max(1, NUMBERS // batches[0].shape[-1]))
+    return torch.cat([f(*piece) for piece in zip(*(batch.split(rows) for batch in batches), strict=True)])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 SourceKind = Literal["gaussian", "gp", "cgp"]
-NetworkKind = Literal["resmlp", "spectral"]
+NetworkKind = Literal["resmlp", "spectral", "attention"]
 Smoothing = Literal["filter", "covariant"]
 Edges = Literal["zero", "nearest", "normalised"]
 Place = Literal["point", "end"]

@@ -31,6 +31,7 @@ class Barrier:
     """The barrier as a function of the clearances c = d - r, and which of them count.
 
     softplus: C_gamma = -1/gamma log(1 + exp(-gamma c)) (Eq. c). relu: C = min(c, 0), its limit for large gamma.
+    square: C = -min(c, 0)^2 / 2, whose slope goes to 0 with the violation.
     Reduction "sum" and "mean" are over the waypoints; "closest" takes C at the closest approach alone. The paper
     leaves open which of them it means. Of the clearances at a waypoint the smallest counts, or all do.
 
@@ -45,11 +46,15 @@ class Barrier:
 
     def value(self, c: Tensor) -> Tensor:
         """C at clearance c."""
-        return -F.softplus(-self.gamma * c) / self.gamma if self.shape == "softplus" else c.clamp(max=0)
+        if self.shape == "softplus":
+            return -F.softplus(-self.gamma * c) / self.gamma
+        return c.clamp(max=0) if self.shape == "relu" else -c.clamp(max=0).square() / 2
 
     def slope(self, c: Tensor) -> Tensor:
         """dC/dc at clearance c."""
-        return torch.sigmoid(-self.gamma * c) if self.shape == "softplus" else (c < 0).to(c.dtype)
+        if self.shape == "softplus":
+            return torch.sigmoid(-self.gamma * c)
+        return (c < 0).to(c.dtype) if self.shape == "relu" else -c.clamp(max=0)
 
     def total(self, c: Tensor) -> Tensor:
         """C of trajectories with clearances c (batch, T, n), (batch,)."""
@@ -127,6 +132,11 @@ class Constraint(nn.Module, ABC):
         c, pullback = self.vjp(x)
         return pullback(self.shape.slopes(c))
 
+    def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """C(x), (batch,), and grad C(x), (batch, T, D), from the same clearances."""
+        c, pullback = self.vjp(x)
+        return self.shape.total(c), pullback(self.shape.slopes(c))
+
     def violation(self, x: Tensor) -> Tensor:
         """M(x), boolean (batch,): some waypoint is in violation, or is not a number."""
         return ~(self.clearance(x).amin(dim=1) >= 0)
@@ -184,6 +194,10 @@ class Sum(Constraint):
 
     def gradient(self, x: Tensor) -> Tensor:
         return torch.stack([term.gradient(x) for term in self.terms]).sum(dim=0)
+
+    def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        C, g = zip(*(term.barrier_and_gradient(x) for term in self.terms), strict=True)
+        return torch.stack(C).sum(dim=0), torch.stack(g).sum(dim=0)
 
     def shaped(self, shape: Barrier, margin: float = 0.0) -> Constraint:
         return Sum([term.shaped(shape, margin) for term in self.terms])

@@ -35,6 +35,10 @@ class Robots(ABC):
     def pullback(self, x: Tensor, g: Tensor) -> Tensor:
         """The gradient with respect to configurations x, (batch, T, D), of one g with respect to `points(x)`."""
 
+    def of_numbers(self, D: int) -> "Robots":
+        """The robots that configurations of D numbers are of: these."""
+        return self
+
     def moved(self, g: Tensor) -> Tensor:
         """Which bodies a change g (batch, T, D) of the configuration moves, boolean (batch, T, bodies); here all."""
         return torch.ones(*g.shape[:2], len(self.owner), dtype=torch.bool, device=g.device)
@@ -70,3 +74,31 @@ class Discs(Robots):
 
     def moved(self, g: Tensor) -> Tensor:
         return g.unflatten(2, (-1, 2)).any(dim=3)
+
+    def apart(self, x: Tensor) -> Tensor:
+        """The gap between every two discs at every waypoint of x (batch, T, D), (batch, T, count, count)."""
+        p, radii = self.points(x).movedim(3, 0), self.radii.to(x.dtype)
+        w_x, w_y = p[..., None] - p[..., None, :]
+        return (w_x * w_x + w_y * w_y).sqrt() - (radii[:, None] + radii)
+
+
+class Crowd(Discs):
+    """Discs of one radius, as many as a configuration has numbers for: D = 2 for each that is there.
+
+    `count` and D are of the most that a task has. What does not ask for them takes any number.
+
+    Args:
+        count: how many there are at most.
+        radius: of all of them.
+    """
+
+    def __init__(self, count: int, radius: float) -> None:
+        super().__init__(count, radius)
+        self.radius = radius
+
+    def of_numbers(self, D: int) -> "Crowd":
+        """As many discs as D numbers place."""
+        return self if D == self.D else Crowd(D // 2, self.radius)
+
+    def apart(self, x: Tensor) -> Tensor:
+        return Discs.apart(self, x) if x.shape[2] == self.D else self.of_numbers(x.shape[2]).apart(x)

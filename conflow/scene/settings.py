@@ -6,7 +6,7 @@ A range beside a type is what the setting may be: from `low` to `high`, or `abov
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-BarrierShape = Literal["softplus", "relu"]
+BarrierShape = Literal["softplus", "relu", "square"]
 Reduction = Literal["sum", "mean", "closest"]
 Pairs = Literal["nearest", "all"]
 
@@ -46,3 +46,14 @@ class Obstacle:
     x: Annotated[float, {"low": -2, "high": 2}] = 0.0
     y: Annotated[float, {"low": -2, "high": 2}] = 0.5
     radius: Annotated[float, {"above": 0, "high": 2}] = 0.1
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangle whose corners are rounded: centre (x, y), full size, and the radius of the corners."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    rounding: float = 0.0

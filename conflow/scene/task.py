@@ -9,6 +9,7 @@ from torch import Tensor
 from conflow.scene.constraint import Constraint
 from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.robots import Robots
+from conflow.scene.settings import Box
 
 
 class Task(ABC):
@@ -64,10 +65,22 @@ class Task(ABC):
     def demonstrations(self, num: int, seed: int) -> Tensor | Demonstrations:
         """`num` trajectories x (num, T, D), a function of the seed, with labels if one has them."""
 
+    def variants(self) -> "Sequence[Task]":
+        """Tasks whose demonstrations training sees in turn, such as with fewer robots; the last is like this one."""
+        return (self,)
+
+    def of_numbers(self, D: int) -> "Task":
+        """The task for configurations of D numbers: this one, or of a crowd the same with as many robots."""
+        return self
+
     def judged(self) -> Mapping[str, Constraint]:
         """All constraints by name, as samples are measured by them."""
         return {**self.constraints(), **self.constraints_at_inference()}
 
     def obstacles(self) -> Sequence[tuple[float, float, float]]:
         """Discs (x, y, radius) that pictures show."""
+        return ()
+
+    def boxes(self) -> Sequence[Box]:
+        """Boxes that are always there, and that pictures show."""
         return ()

@@ -5,23 +5,27 @@ import importlib.util
 import inspect
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from conflow.errors import ConfigError, brief
+from conflow.errors import ConfigError, brief, nearest
 from conflow.flow import settings as of_flow
 from conflow.flow import source
-from conflow.flow.correction import Correction, covariant, gaussian_filter, repair
-from conflow.flow.network import ResMLP, SpectralMLP
+from conflow.flow.attention import HEADS, SpectralAttention
+from conflow.flow.correction import Correction, covariant, descend, gaussian_filter
+from conflow.flow.network import ResMLP, Spectral, SpectralMLP
+from conflow.flow.sampler import in_pieces
 from conflow.flow.source import Source
 from conflow.scene.constraint import Barrier, Constraint, Sum, Workspace
+from conflow.scene.robots import Crowd, Discs, Robots
 from conflow.scene.task import Task
-from conflow.scene.tasks import TASKS
+from conflow.scene.tasks import SWAPS, TASKS
 from conflow.training import config
 from conflow.training.config import Config
 
@@ -38,8 +42,12 @@ def build_task(settings: Config, T: int | None = None, D: int = 4) -> Task:
         ConfigError: it is a file of which no task can be had.
     """
     if config.is_file(settings.task):
-        return task_of_file(Path(settings.task))
-    return TASKS[settings.task](
+        return task_of_file(Path(settings.task), settings.of_task)
+    if settings.task not in SWAPS:
+        return made(TASKS[settings.task], settings.task, settings.of_task)
+    for name, value in settings.of_task.items():
+        raise ConfigError(f"task.{name}={brief(value)}: task {settings.task} has no settings of its own")
+    return SWAPS[settings.task](
         T or settings.data.horizon,
         D,
         settings.constraint.radius,
@@ -50,8 +58,25 @@ def build_task(settings: Config, T: int | None = None, D: int = 4) -> Task:
     )
 
 
-def task_of_file(path: Path) -> Task:
-    """The task that a Python file defines: runs the file, and makes its one subclass of `Task`, without arguments.
+def made(kind: Callable[..., Task], name: str, of_task: Mapping[str, Any]) -> Task:
+    """A task of a class, made with settings of its own: the arguments that its constructor names.
+
+    Raises:
+        ConfigError: it takes no such argument, or refuses a value.
+    """
+    takes = [one for one in inspect.signature(kind).parameters if one not in ("args", "kwargs")]
+    for one, value in of_task.items():
+        if one not in takes:
+            expected = f"expected one of {', '.join(takes)}{nearest(one, takes)}" if takes else "it takes none"
+            raise ConfigError(f"task.{one}={brief(value)}: no such setting of task {name}, {expected}")
+    try:
+        return kind(**of_task)
+    except ValueError as error:
+        raise ConfigError(f"task {name}: {error}") from None
+
+
+def task_of_file(path: Path, of_task: Mapping[str, Any] = MappingProxyType({})) -> Task:
+    """The task that a Python file defines: runs the file, and makes its one subclass of `Task` with its own settings.
 
     Raises:
         ConfigError: there is no such file, it is called as a named task is, it fails, or it has none or several.
@@ -72,12 +97,11 @@ def task_of_file(path: Path) -> Task:
             raise ConfigError(f"task={brief(path)}: expected one class that is a conflow.Task, found {names}")
         if missing := sorted(getattr(found[0], "__abstractmethods__", ())):
             raise ConfigError(f"task={brief(path)}: expected {found[0].__name__} to define {', '.join(missing)}")
-        task: Task = found[0]()
+        return checked(made(found[0], path.stem, of_task), brief(path))
     except ConfigError:
         raise
     except (Exception, SystemExit) as error:  # somebody else's code may fail in any way, or end
         raise ConfigError(f"task={brief(path)}: {type(error).__name__}: {brief(error)}") from error
-    return checked(task, brief(path))
 
 
 def checked(task: Task, name: str) -> Task:
@@ -187,18 +211,44 @@ def build_correction(chosen: of_flow.Correction, constraint: Constraint, source:
     return Correction(constraint, smoothing)
 
 
-def build_network(chosen: of_flow.Network, source: Source, D: int, constraint: Constraint) -> ResMLP | SpectralMLP:
+def build_network(chosen: of_flow.Network, source: Source, robots: Robots, constraint: Constraint) -> ResMLP | Spectral:
     """The velocity network v_theta."""
-    if chosen.kind == "spectral":
-        return SpectralMLP(source, D, constraint, chosen.hidden, chosen.blocks)
-    return ResMLP(len(source.prior), D, chosen.hidden, chosen.blocks, chosen.sees_ends)
+    if chosen.kind == "resmlp":
+        return ResMLP(len(source.prior), robots.D, chosen.hidden, chosen.blocks, chosen.sees_ends)
+    if chosen.kind == "spectral" and not isinstance(robots, Crowd):
+        return SpectralMLP(source, robots.D, constraint, chosen.hidden, chosen.blocks)
+    if not isinstance(robots, Discs):
+        raise ConfigError(f"network.kind={chosen.kind}: expected robots that are discs, found {type(robots).__name__}")
+    if chosen.hidden % HEADS:
+        raise ConfigError(f"network.hidden={chosen.hidden}: expected a multiple of {HEADS}, the heads of attention")
+    each = robots.D // robots.count
+    return SpectralAttention(source, each, constraint, robots.apart, chosen.hidden, chosen.blocks)
+
+
+REPAIR_STEPS, MOMENTUM = 100, 0.7
+"""Of descent: steps that mend demonstrations, and how much of a step the next one keeps."""
+
+
+def descending(settings: Config, task: Task, source: Source, more: Sequence[Constraint] = ()) -> Correction:
+    """The correction that `descent` follows: of all that training keeps, with its margin, by the square barrier.
+
+    Args:
+        settings: for margin and walls.
+        task: what is kept.
+        source: along whose covariance trajectories move.
+        more: constraints beside those of the task.
+    """
+    shape, margin = Barrier("square", pairs="all"), settings.correction.margin
+    terms = [one.shaped(shape, margin) for one in (*task.constraints().values(), *more)]
+    # A little inside the walls, so that rounding leaves nothing outside.
+    walls = [Workspace(task.robots).shaped(shape, margin)] if settings.correction.walls else []
+    return Correction(joined([*terms, *walls]), covariant(source.covariance))
 
 
 def repaired(settings: Config, task: Task, x: Tensor) -> Tensor:
     """Demonstrations x (N, T, D), those in violation moved out of it by the margin, along the source's covariance."""
-    shape, margin = Barrier("relu"), settings.correction.margin
-    constraint = joined([one.shaped(shape, margin) for one in task.constraints().values()])
-    return repair(x, Correction(constraint, covariant(build_source(settings.source, x.shape[1]).covariance)))
+    u_c = descending(settings, task, build_source(settings.source, x.shape[1]))
+    return in_pieces(lambda piece: descend(piece, u_c, REPAIR_STEPS, MOMENTUM), x)
 
 
 def random_stream(*key: str | int, device: torch.device | str = "cpu") -> torch.Generator:

@@ -28,11 +28,15 @@ Norm = Literal["waypoints", "modes"]
 Accelerator = Literal["auto", "cpu", "gpu", "mps"]
 SplitName = Literal["val", "test"]
 PAPERS_TASK = "swap"
+SWAPS = ("passing", "social", PAPERS_TASK)
+"""The tasks of two robots that swap sides."""
 Tree = dict[str, Any]
 
 SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
 """The splits that are held out, and what each is called in titles and in the names of metrics."""
 
+OF_TASK = "task."
+"""Begins the settings that are a task's own."""
 SIZES = (
     "data.num",
     "network.hidden",
@@ -45,7 +49,7 @@ SIZES = (
 )
 """How much is computed: whole numbers that presets set, and that an ablation does not set but may multiply."""
 OF_SWAPS = ("data.horizon", "data.amplitudes", "data.jitter", "constraint.radius", "sample.obstacle.", "sample.radius")
-"""Settings of the tasks of two robots that swap sides: a task of one's own says in its file what these do."""
+"""Settings of SWAPS; another task has its own, `task.NAME`, or says in its file what these do."""
 MOST_NUMBERS = 64
 """The longest list that a setting may be: OmegaConf takes its time over each number."""
 
@@ -90,6 +94,7 @@ class Sample:
     solver: Solver
     steps: Count
     guidance: Guidance
+    descent: Annotated[int, {"low": 0, "high": 10**6}]
     robot_weight: Weight
     obstacle_weight: Weight
     obstacle: Obstacle
@@ -98,7 +103,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class Config:
-    """One experiment. The comments of `conf/base.yaml` say what each setting is."""
+    """One experiment. The comments of `conf/base.yaml` say what each setting is.
+
+    Attributes:
+        of_task: what the task is made with, `task.NAME=value` in arguments: numbers, texts, or lists of numbers.
+    """
 
     task: str
     ablation: str
@@ -111,14 +120,18 @@ class Config:
     network: Network
     train: Train
     sample: Sample
+    of_task: Tree = dataclasses.field(default_factory=dict)
 
     def tree(self) -> Tree:
-        """The whole as nested dictionaries of plain values."""
-        return dataclasses.asdict(self)
+        """The whole as nested dictionaries of plain values; those of the task have their whole key, `task.NAME`."""
+        tree = dataclasses.asdict(self)
+        return tree | {f"{OF_TASK}{name}": value for name, value in tree.pop("of_task").items()}
 
     def identity(self) -> Tree:
         """The settings that say which experiment this is: all but the accelerator, on which it may go on elsewhere."""
         tree = self.tree() | {"task": self.task_name}
+        if not tree["sample"]["descent"]:
+            del tree["sample"]["descent"]  # runs from before there was such a thing are of the same experiment
         del tree["train"]["accelerator"]
         if is_file(self.task):
             tree["task_code"] = code.of_file(Path(self.task))
@@ -166,7 +179,7 @@ def names(axis: str) -> list[str]:
 def load(arguments: Sequence[str] = ()) -> Config:
     """conf/base.yaml, then task, preset and ablation, then arguments `key=value`, checked.
 
-    An ablation's block `times` multiplies what base and preset say, so that its lengths follow every preset.
+    A block `times` of a task or an ablation multiplies what base and preset say, so that lengths follow every preset.
 
     Raises:
         ConfigError: an unknown name, a value of the wrong type or out of range.
@@ -174,6 +187,8 @@ def load(arguments: Sequence[str] = ()) -> Config:
     from omegaconf import OmegaConf
 
     pairs = [split(argument) for argument in arguments]
+    of_task = {key: _plain(key, value) for key, value in pairs if key.startswith(OF_TASK)}
+    pairs = [(key, value) for key, value in pairs if key not in of_task]
     base = _read("base")
     chosen = {axis: str(dict(pairs).get(axis, base[axis])) for axis in ("task", "preset", "ablation")}
     for axis, name in chosen.items():
@@ -183,19 +198,36 @@ def load(arguments: Sequence[str] = ()) -> Config:
     check_file(chosen["task"])
     task = {} if is_file(chosen["task"]) else _read(f"task/{chosen['task']}")
     preset, ablation = (_read(f"{axis}/{chosen[axis]}") for axis in ("preset", "ablation"))
-    factors = _factors(f"conf/ablation/{chosen['ablation']}.yaml", ablation.pop("times", {}))
+    multiplied = [
+        _factors(f"conf/{axis}/{chosen[axis]}.yaml", tree.pop("times", {}))
+        for axis, tree in (("task", task), ("ablation", ablation))
+    ]
     settings = _schema(Config)
     for key, value in (flatten(base) | flatten(task) | flatten(preset)).items():
         _set(settings, key, value)
-    for key, factor in factors.items():
-        _set(settings, key, _multiplied(key, OmegaConf.select(settings, key), factor))
+    for factors in multiplied:
+        for key, factor in factors.items():
+            _set(settings, key, _multiplied(key, OmegaConf.select(settings, key), factor))
     for key, value in [*flatten(ablation).items(), *pairs]:
         _set(settings, key, value)
-    for key, value in pairs if is_file(chosen["task"]) else ():
+    for key, value in pairs if chosen["task"] not in SWAPS else ():
         if key.startswith(OF_SWAPS):
-            swaps = ", ".join(names("task"))
-            raise ConfigError(f"{key}={brief(value)}: expected one of the tasks {swaps}, which it belongs to")
-    return from_tree(OmegaConf.to_container(settings))
+            expected = f"expected one of the tasks {', '.join(SWAPS)}, which it belongs to"
+            raise ConfigError(f"{key}={brief(value)}: {expected}")
+    return from_tree(_container(settings) | of_task)
+
+
+def _plain(key: str, text: str) -> Any:
+    """What a task's own setting means: a number, true or false, null, a list of numbers, or else the text itself."""
+    import yaml
+
+    try:
+        value = yaml.safe_load(text) if re.fullmatch(r"[\w.+-]*|\[[\w.+, -]*\]", text) else text
+    except yaml.YAMLError:
+        value = text
+    if isinstance(value, list) and not (all(type(one) in (int, float) for one in value) and len(value) <= MOST_NUMBERS):
+        raise ConfigError(f"{brief(key)}={brief(text)}: expected {_describe(list[float])}")
+    return value if isinstance(value, bool | int | float | list | None) else text
 
 
 def _factors(file: str, times: Any) -> dict[str, float]:
@@ -229,15 +261,17 @@ def from_tree(tree: Any) -> Config:
     Raises:
         ConfigError: as `load`; also where a setting is missing.
     """
-    config = _built(Config, tree)
+    own = {key: value for key, value in tree.items() if str(key).startswith(OF_TASK)} if isinstance(tree, dict) else {}
+    config = _built(Config, {key: value for key, value in tree.items() if key not in own} if own else tree)
     assert isinstance(config, Config)
+    config = dataclasses.replace(config, of_task={key.removeprefix(OF_TASK): value for key, value in own.items()})
     _check(config)
     return config
 
 
 def _built(cls: type, tree: Any, prefix: str = "") -> Any:
     """The dataclass of a tree of plain values, without OmegaConf, which takes its time."""
-    hints = get_type_hints(cls)
+    hints = {name: kind for name, kind in get_type_hints(cls).items() if kind != Tree}
     if not isinstance(tree, dict):
         raise ConfigError(f"{prefix.removesuffix('.') or 'settings'}={brief(tree)}: expected nested settings")
     for key in map(str, tree):
@@ -276,17 +310,17 @@ def override(config: Config, arguments: Sequence[str], allowed: Sequence[str]) -
     Raises:
         ConfigError: as `load`; also for a key that is not allowed.
     """
-    from omegaconf import OmegaConf
-
     settings = _schema(Config)
+    of_task = {f"{OF_TASK}{name}": value for name, value in config.of_task.items()}
     for key, value in flatten(config.tree()).items():
-        _set(settings, key, value)
+        if key not in of_task:
+            _set(settings, key, value)
     for key, value in map(split, arguments):
         _set(settings, key, value)
         if not key.startswith(tuple(allowed)):
             expected = f"expected settings of {' and '.join(allowed)} only"
             raise ConfigError(f"{key}={brief(value)}: fixed by the run, {expected}")
-    return from_tree(OmegaConf.to_container(settings))
+    return from_tree(_container(settings) | of_task)
 
 
 def flatten(tree: Tree, prefix: str = "") -> Tree:
@@ -301,6 +335,8 @@ def _fields(cls: type = Config, prefix: str = "") -> Iterator[tuple[str, Any, Ra
     """Every setting's dotted key, type and range."""
     for name, annotation in get_type_hints(cls, include_extras=True).items():
         kind, bounds = get_args(annotation) if get_origin(annotation) is Annotated else (annotation, {})
+        if kind == Tree:
+            continue  # of the task, which knows them itself
         if dataclasses.is_dataclass(kind):
             yield from _fields(cast(type, kind), f"{prefix}{name}.")
         else:
@@ -323,6 +359,15 @@ def _schema(cls: type) -> Any:
         if dataclasses.is_dataclass(kind):
             node[name] = _schema(cast(type, kind))
     return node
+
+
+def _container(settings: Any) -> Tree:
+    """The typed tree as plain values, without the place of what is the task's."""
+    from omegaconf import OmegaConf
+
+    tree = OmegaConf.to_container(settings)
+    assert isinstance(tree, dict)
+    return {str(key): value for key, value in tree.items() if key != "of_task"}
 
 
 def _read(name: str) -> Tree:
@@ -424,12 +469,8 @@ def _check(config: Config) -> None:
         raise ConfigError("correction.path=guided: expected correction.at=point, the path is guided at its own points")
     if config.correction.at != "end" and config.correction.ramp != 1:
         raise ConfigError(f"correction.ramp={config.correction.ramp}: expected correction.at=end, which it belongs to")
-    if config.data.negative_share is not None and (not config.data.negatives or config.data.repair):
-        raise ConfigError(
-            f"data.negative_share={config.data.negative_share}: expected data.negatives=true and data.repair=false"
-        )
-    if config.data.repair and not config.data.negatives:
-        raise ConfigError("data.repair=True: expected data.negatives=true, there is nothing to repair in D+")
+    if config.data.negative_share is not None and not config.data.negatives:
+        raise ConfigError(f"data.negative_share={config.data.negative_share}: expected data.negatives=true")
     if config.data.repair and not config.correction.margin:
         # Repair comes as near to the boundary as it wants, from within: without a margin the label would not change.
         raise ConfigError("correction.margin=0.0: expected a number above 0 where data.repair=true")
@@ -438,13 +479,13 @@ def _check(config: Config) -> None:
         expected = "expected sum or mean where constraint.pairs=all, or constraint.pairs=nearest"
         raise ConfigError(f"constraint.reduction=closest: {expected}")
     if config.source.kind == "gaussian" and (
-        config.correction.smoothing == "covariant" or config.network.kind == "spectral"
+        config.correction.smoothing == "covariant" or config.network.kind != "resmlp"
     ):
         raise ConfigError("source.kind=gaussian: expected gp or cgp where the source's covariance is asked for")
-    if config.train.norm == "modes" and config.network.kind != "spectral":
-        raise ConfigError("train.norm=modes: expected network.kind=spectral, which has modes")
-    if config.network.sees_ends and config.network.kind == "spectral":
-        raise ConfigError("network.sees_ends=True: expected network.kind=resmlp, spectral takes start and goal from x")
+    if config.train.norm == "modes" and config.network.kind == "resmlp":
+        raise ConfigError("train.norm=modes: expected network.kind=spectral or attention, which have modes")
+    if config.network.sees_ends and config.network.kind != "resmlp":
+        raise ConfigError("network.sees_ends=True: expected network.kind=resmlp, others take start and goal from x")
     if config.correction.keep_ends and config.correction.smoothing == "covariant":
         raise ConfigError("correction.keep_ends=True: expected correction.smoothing=filter, covariant always does")
     if config.source.fit and config.source.kind == "gaussian":

@@ -1,6 +1,7 @@
 """Demonstrations for training and evaluation: generated or read, labelled, split, and served in whole batches."""
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -34,33 +35,37 @@ class Batches:
     Iteration starts after `step` batches, which `state_dict` remembers.
 
     Args:
-        negative_share: of D- in each batch; None draws from all alike.
+        negative_share: of D- in each batch; None, or one of both alone, draws from all alike.
+        others: demonstrations of fewer robots, seen in turn with these, as many more at a time as they are smaller.
     """
 
     def __init__(
-        self, split: Split, batch_size: int, steps: int, seed: int, negative_share: float | None = None
+        self,
+        split: Split,
+        batch_size: int,
+        steps: int,
+        seed: int,
+        negative_share: float | None = None,
+        others: Sequence[Split] = (),
     ) -> None:
-        self.split, self.steps, self.seed = split, steps, seed
-        parts = [(torch.ones_like(split.violates), batch_size)]
-        if negative_share is not None:
-            negatives = round(negative_share * batch_size)
-            parts = [(split.violates, negatives), (~split.violates, batch_size - negatives)]
-        self.parts = [(chosen.nonzero()[:, 0], count) for chosen, count in parts if count]
+        self.splits, self.steps, self.seed = (split, *others), steps, seed
+        D = split.x.shape[2]
+        self.parts = [
+            _parts(one.violates, round(batch_size * D / one.x.shape[2]), negative_share) for one in self.splits
+        ]
         self.step = 0
 
     def __len__(self) -> int:
         return self.steps
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
-        x, violates = self.split
         for step in range(self.step, self.steps):
+            turn = step % len(self.splits)
+            (x, violates), parts = self.splits[turn], self.parts[turn]
             # Drawn where the data are: a copy from the host at every step would make an accelerator wait.
             noise = random_stream("batch", self.seed, step, device=x.device)
             i = torch.cat(
-                [
-                    part[torch.randint(len(part), (count,), generator=noise, device=x.device)]
-                    for part, count in self.parts
-                ]
+                [part[torch.randint(len(part), (count,), generator=noise, device=x.device)] for part, count in parts]
             )
             self.step = step + 1
             yield x[i], violates[i]
@@ -70,6 +75,15 @@ class Batches:
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         self.step = state["step"]
+
+
+def _parts(violates: Tensor, batch_size: int, negative_share: float | None) -> list[tuple[Tensor, int]]:
+    """Which trajectories a batch is drawn from, and how many from each."""
+    parts = [(torch.ones_like(violates), batch_size)]
+    if negative_share is not None and 0 < int(violates.sum()) < len(violates):
+        negatives = round(negative_share * batch_size)
+        parts = [(violates, negatives), (~violates, batch_size - negatives)]
+    return [(chosen.nonzero()[:, 0], count) for chosen, count in parts if count]
 
 
 class DemonstrationData(LightningDataModule):
@@ -84,6 +98,7 @@ class DemonstrationData(LightningDataModule):
             split, of which `val` is what val/loss is taken on.
         origin: where the demonstrations are from, as messages say it.
         task: what they are for.
+        others: of the task's other `variants`, for training alone.
         x, violates: all demonstrations and their labels M.
         digest: fingerprint of x, and of the labels that came with it; others follow from x and the config.
 
@@ -107,6 +122,16 @@ class DemonstrationData(LightningDataModule):
         self.digest = demonstrations.digest(x, violates)
         self.held_out: dict[SplitName, Split] = {}
         self.train, self.val, self.test = self._split(self.origin)
+        self.others = self._others() if config.data.path is None else []
+        if self.others:
+            every = [self.digest, *(demonstrations.digest(one.x, None) for one in self.others)]
+            self.digest = hashlib.sha256(" ".join(every).encode()).hexdigest()[: len(self.digest)]
+
+    @property
+    def known(self) -> Tensor:
+        """What a source and a network are fitted to: D+ of the training, or all where there is none, (N, T, D)."""
+        feasible = self.train.feasible().x
+        return feasible if len(feasible) else self.train.x
 
     def _demonstrations(self, task: Task | None) -> tuple[str, Demonstrations, Task]:
         """Where they are from, what they are, and the task they are for."""
@@ -147,20 +172,20 @@ class DemonstrationData(LightningDataModule):
         parts = torch.split(order, [len(order) - val - test, val, test])
         train_split, val_split, test_split = (Split(self.x[i], self.violates[i]) for i in parts)
         self.held_out |= {"val": val_split, "test": test_split}
-        if len(train_split.x) and bool(train_split.violates.all()):
+        if data.negatives and not bool(train_split.violates.any()):
             raise DemonstrationError(
-                f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, expected D+ too"
+                f"{name}: no trajectory for training violates the constraint, and ablation "
+                f"{self.config.ablation} needs D-"
             )
-        if data.negatives:
-            if not bool(train_split.violates.any()):
-                raise DemonstrationError(
-                    f"{name}: no trajectory for training violates the constraint, and ablation "
-                    f"{self.config.ablation} needs D-"
-                )
-        else:
-            train_split, val_split = train_split.feasible(), val_split.feasible()
         if data.repair:
-            train_split, val_split = self._repaired(train_split), self._repaired(val_split)
+            train_split, val_split = (self._repaired(one, self.task) for one in (train_split, val_split))
+        if not data.negatives:
+            if len(train_split.x) and bool(train_split.violates.all()):
+                raise DemonstrationError(
+                    f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, and ablation "
+                    f"{self.config.ablation} needs D+"
+                )
+            train_split, val_split = train_split.feasible(), val_split.feasible()
         # Of a single test trajectory there is no diversity.
         for part, split, needed in (
             ("training", train_split, 1),
@@ -172,16 +197,30 @@ class DemonstrationData(LightningDataModule):
                 raise DemonstrationError(f"{name}: {left}, expected {needed} or more")
         return train_split, val_split, test_split
 
-    def _repaired(self, split: Split) -> Split:
-        x = repaired(self.config, self.task, split.x)
-        return Split(x, labels(self.config, self.task).violation(x))
+    def _others(self) -> list[Split]:
+        """What training sees of the task's other variants."""
+        data, found = self.config.data, []
+        for task in self.task.variants()[:-1]:
+            made = task.demonstrations(data.num, data.seed)
+            x = made.x if isinstance(made, Demonstrations) else made
+            split = Split(x, labels(self.config, task).violation(x))
+            split = self._repaired(split, task) if data.repair else split
+            split = split if data.negatives else split.feasible()
+            if len(split.x):
+                found.append(split)
+        return found
+
+    def _repaired(self, split: Split, task: Task) -> Split:
+        x = repaired(self.config, task, split.x)
+        return Split(x, labels(self.config, task).violation(x))
 
     def train_dataloader(self) -> Batches:
         train = self.config.train
         # The data move to the accelerator once, not batch by batch.
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
-        split = Split(self.train.x.to(device), self.train.violates.to(device))
-        return Batches(split, train.batch_size, train.max_steps, self.config.seed, self.config.data.negative_share)
+        split, *others = (Split(one.x.to(device), one.violates.to(device)) for one in (self.train, *self.others))
+        share = self.config.data.negative_share
+        return Batches(split, train.batch_size, train.max_steps, self.config.seed, share, others)
 
     def val_dataloader(self) -> DataLoader[tuple[Tensor, ...]]:
         """The whole of `val` as one batch."""

@@ -127,8 +127,8 @@ def _mixture_distance(negatives: Tensor, feasible: Tensor) -> Metrics:
 
 
 def _latency_ms(model: ConFlow, x_1: Tensor, setting: str, repetitions: int = 3) -> float:
-    """Median time of sampling one batch of 256, in milliseconds."""
-    x_1 = cycle(x_1, LATENCY_BATCH)
+    """Median time of sampling one batch, in milliseconds: 256 trajectories of two robots, fewer of more."""
+    x_1 = cycle(x_1, max(1, 2 * LATENCY_BATCH // model.task.robots.count))
     times = []
     for _ in range(repetitions):
         start = time.perf_counter()

@@ -8,17 +8,30 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from conflow.flow.correction import Correction
-from conflow.flow.network import SpectralMLP
+from conflow.flow.correction import Correction, descend
+from conflow.flow.network import Spectral
 from conflow.flow.path import end, guided_path, interpolate, velocity
 from conflow.flow.sampler import GUIDANCE, Field, in_pieces, integrate
 from conflow.scene.constraint import Constraint
+from conflow.scene.robots import Crowd
 from conflow.scene.task import Task
-from conflow.training.build import barrier, build_correction, build_network, build_source, joined, kept, labels
+from conflow.training.build import (
+    MOMENTUM,
+    barrier,
+    build_correction,
+    build_network,
+    build_source,
+    descending,
+    joined,
+    kept,
+    labels,
+)
 from conflow.training.config import Config
 
 NONE = "none"
 """The setting without guidance; the others are the task's."""
+REFINED = "refined"
+"""The setting guided around all that training keeps, with `sample.descent` steps of descent after the flow."""
 
 
 class ConFlow(nn.Module):
@@ -42,8 +55,9 @@ class ConFlow(nn.Module):
         self.judged = cast(
             Mapping[str, Constraint], nn.ModuleDict({name: one.shaped(shape) for name, one in task.judged().items()})
         )
-        self.v = build_network(config.network, self.source, self.D, labels(config, task))
+        self.v = build_network(config.network, self.source, task.robots, labels(config, task))
         self.u_c = build_correction(config.correction, kept(config, task), self.source)
+        self.descending = descending(config, task, self.source)
         self.u_c_at_inference = cast(
             Mapping[str, Correction],
             nn.ModuleDict(
@@ -54,6 +68,14 @@ class ConFlow(nn.Module):
             ),
         )
 
+    def of_numbers(self, D: int) -> "ConFlow":
+        """The same model for configurations of D numbers, such as of more robots of a crowd: its weights, shared."""
+        if D == self.D or not isinstance(self.task.robots, Crowd):
+            return self
+        made = ConFlow(self.config, self.task.of_numbers(D))
+        made.v.load_state_dict(self.v.state_dict(), assign=True)
+        return made.eval()
+
     @property
     def device(self) -> torch.device:
         """Where it is."""
@@ -62,7 +84,7 @@ class ConFlow(nn.Module):
     @property
     def settings(self) -> Sequence[str]:
         """Under which it is sampled: without guidance, and the task's."""
-        return (NONE, *self.task.settings())
+        return (NONE, *self.task.settings(), *([REFINED] if self.config.sample.descent else []))
 
     @property
     def trained(self) -> Constraint:
@@ -71,7 +93,7 @@ class ConFlow(nn.Module):
 
     def fit(self, x_1: Tensor) -> None:
         """What is known of the demonstrations x_1 (N, T, D) before training."""
-        if isinstance(self.v, SpectralMLP):
+        if isinstance(self.v, Spectral):
             self.v.fit(x_1)
 
     def loss(self, x_1: Tensor, M: Tensor, noise: torch.Generator) -> Tensor:
@@ -95,12 +117,14 @@ class ConFlow(nn.Module):
     def distance(self, v: Tensor, u: Tensor) -> Tensor:
         """|v - u|^2 of velocities (batch, T, D), the mean over batch, waypoints and dimensions, or over modes."""
         if self.config.train.norm == "modes":
-            assert isinstance(self.v, SpectralMLP)  # the config was checked
+            assert isinstance(self.v, Spectral)  # the config was checked
             v, u = self.v.balanced(v), self.v.balanced(u)
         return F.mse_loss(v, u)
 
     def guided_around(self, setting: str) -> Sequence[str]:
         """The names of the constraints that a setting guides around."""
+        if setting == REFINED:
+            return tuple(self.task.constraints())
         return () if setting == NONE else self.task.settings()[setting]
 
     def required(self, setting: str) -> Constraint:
@@ -138,7 +162,8 @@ class ConFlow(nn.Module):
         """Where the ODE of `field` takes samples x_0 of the source, (batch, T, D)."""
 
         def arrive(x_0: Tensor, ends: Tensor | None = None) -> Tensor:
-            return integrate(self.field(setting, ends), x_0, self.config.sample.steps, self.config.sample.solver)
+            x = integrate(self.field(setting, ends), x_0, self.config.sample.steps, self.config.sample.solver)
+            return descend(x, self.descending, self.config.sample.descent, MOMENTUM) if setting == REFINED else x
 
         return in_pieces(arrive, x_0) if ends is None else in_pieces(arrive, x_0, ends)
 

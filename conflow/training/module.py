@@ -74,12 +74,13 @@ class Training(ConFlow, LightningModule):
         torch.set_num_threads(checkpoint["conflow"]["threads"])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        scale, offset = self.task.scale, self.task.offset
+        # Plain numbers: of others, such as NumPy's, a file that is read without running code may hold none.
+        offset: float | list[float] = torch.as_tensor(self.task.offset, dtype=torch.float64).tolist()
         checkpoint["conflow"] = {
             "config": self.config.tree(),
             "T": self.T,
             "D": self.D,
             "threads": torch.get_num_threads(),
-            "scale": scale,
-            "offset": offset if isinstance(offset, int | float) else list(offset),
+            "scale": float(self.task.scale),
+            "offset": offset,
         }

@@ -59,8 +59,8 @@ def train(
     """
     lightning.seed_everything(config.seed, verbose=False)
     data = DemonstrationData(config, task)
-    model = Training(fitted(config, data.train.feasible().x), data.task)
-    model.fit(data.train.feasible().x)
+    model = Training(fitted(config, data.known), data.task)
+    model.fit(data.known)
     interrupted = resume.find(wanted) if wanted else None
     asked = experiment(config, data)
     checkpoint = _continued(interrupted, asked, config, console, any_code) if interrupted else None

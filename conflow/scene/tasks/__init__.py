@@ -1,8 +1,31 @@
 """Tasks: what is moved, under which constraints, and what it is learned from. One file each."""
 
+from collections.abc import Callable, Mapping
+
+from conflow.scene.task import Task
+from conflow.scene.tasks.circle import Circle
+from conflow.scene.tasks.crowd import CrowdTask
+from conflow.scene.tasks.dense import Basic, Dense
+from conflow.scene.tasks.maps import Conveyor, Highways, Room, Shelf
 from conflow.scene.tasks.passing import Passing
+from conflow.scene.tasks.random import Random
 from conflow.scene.tasks.social import Social
 from conflow.scene.tasks.swap import Swap
+from conflow.scene.tasks.weave import Weave
 
-TASKS = {"swap": Swap, "passing": Passing, "social": Social}
+SWAPS = {"swap": Swap, "passing": Passing, "social": Social}
+"""Two robots that swap sides, or more of a file's."""
+CROWDS: Mapping[str, Callable[..., CrowdTask]] = {
+    "circle": Circle,
+    "weave": Weave,
+    "random": Random,
+    "highways": Highways,
+    "conveyor": Conveyor,
+    "basic": Basic,
+    "dense": Dense,
+    "shelf": Shelf,
+    "room": Room,
+}
+"""Many robots, from demonstrations of single ones."""
+TASKS: Mapping[str, Callable[..., Task]] = {**SWAPS, **CROWDS}
 """By the name that `TASK=` chooses."""
