@@ -20,6 +20,9 @@ GOAL     ?=
 OUT      ?=
 NUM      ?=
 PORT     ?= 5000
+# Of `make planbench`.
+N        ?= 28
+SCENES   ?= 64
 ARGS     ?=
 
 PYTHON := .venv/bin/python
@@ -33,7 +36,7 @@ OWN = $(if $(filter %.py,$(TASK)),task=$(TASK))
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
-.PHONY: help train ablations evaluate compare reference sample figures explain demonstrations bench ui test test-faults lint lock
+.PHONY: help train ablations evaluate compare reference sample figures explain demonstrations planbench bench ui test test-faults lint lock
 
 help:  ## List what can be made
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -68,6 +71,10 @@ explain: .venv/installed  ## Draw why the covariant correction works, and what f
 
 demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FILE": TASK=passing, or FROM=tracks.csv; OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations $(if $(FROM),from="$(FROM)",task=$(TASK)) $(WRITTEN) seed=$(SEED) $(ARGS)
+
+planbench: .venv/installed  ## Solve scenes of many robots with models and without: TASK=weave N=28 SCENES=64 RUN=NAME,NAME FORMAT= REFERENCE=1
+	@$(CONFLOW) planbench task=$(if $(filter-out swap,$(TASK)),$(TASK),weave) n=$(N) scenes=$(SCENES) format=$(FORMAT) \
+	$(if $(REFERENCE),reference=1) $(if $(filter-out latest,$(RUN)),run=$(RUN)) $(ARGS)
 
 bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)
 	@$(PYTHON) -m tests.bench format=$(FORMAT) $(if $(REFERENCE),reference=1)

@@ -204,6 +204,22 @@ def demonstrations(arguments: list[str]) -> None:
     print(from_tracks(options) if options["from"] else from_task(options))
 
 
+def planbench(arguments: list[str]) -> None:
+    """Solve scenes of many robots with models and without: task=weave n=28 scenes=64 run=NAME,NAME seed=1 num=16."""
+    from conflow import commandline
+    from conflow.tracking import signals
+
+    signals.raise_on_signals()
+    defaults = {"task": "weave", "n": "28", "scenes": "64", "run": "", "seed": "1", "num": "16", "limit": "5"}
+    defaults |= {"guided": "0", "format": "table", "reference": "0", "out": "runs/planbench"}
+    options, settings = commandline.options(arguments, defaults)
+    options["run"] = options["run"] or f"{options['task']}-plus-s0"
+
+    from conflow.planbench import planbench
+
+    planbench(options, settings, console())
+
+
 def ui(arguments: list[str]) -> None:
     """Serve MLflow's pages of all runs on this machine: port=5000."""
     from conflow import commandline
@@ -226,6 +242,7 @@ COMMANDS = {
     "figures": figures,
     "explain": explain,
     "demonstrations": demonstrations,
+    "planbench": planbench,
     "ui": ui,
 }
 

@@ -54,7 +54,7 @@ def test_imports_go_downwards_only(module: str) -> None:
     training = {"errors", "flow", "scene", "tracking", "training"}
     results = {*training, "results"}
     figures = {*results, "figures"}
-    commands = {"commandline", "demonstrations", "sample"}
+    commands = {"commandline", "demonstrations", "planbench", "sample"}
     below = {
         "errors": set(),
         "flow": {"flow"},
@@ -69,6 +69,7 @@ def test_imports_go_downwards_only(module: str) -> None:
         "commandline": {"errors", "training"},
         "demonstrations": {"errors", "scene", "training", "commandline"},
         "sample": {"errors", "scene", "training", "commandline", "planner", "figures"},
+        "planbench": {*figures, "commandline", "planner"},
         "api": figures,
         "__main__": {*figures, "grid", *commands},
         # The package itself names what programs need, and imports it when they ask for it.

@@ -210,12 +210,12 @@ def origin() -> dict[str, str]:
         "git_sha": sha if sha is not None else "unknown",
         "git_dirty": str(bool(dirty)).lower() if dirty is not None else "unknown",
         "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
-        "hardware": _hardware(),
+        "hardware": hardware(),
         "threads": str(torch.get_num_threads()),
     }
 
 
-def _hardware() -> str:
+def hardware() -> str:
     """The processor, how many cores it has, and the accelerator."""
     names = Path("/proc/cpuinfo")
     models = re.findall(r"model name\s*: (.*)", names.read_text()) if names.exists() else []

@@ -1,0 +1,345 @@
+"""`make planbench`: scene by scene, how soon is there one plan for many robots, and what does a model add to descent?
+
+Candidates, so many at a time, descend on what is to be kept until one of them is feasible. With a model and without,
+methods differ in where candidates come from, and in nothing else. All run on the same scenes, in the same process.
+"""
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from statistics import mean, median
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from conflow import commandline
+from conflow.errors import ConfigError
+from conflow.figures.planbench import animation, success
+from conflow.flow.correction import descent
+from conflow.planner import CHECKED, ROUNDS, exact
+from conflow.results import planbench as results
+from conflow.results.planbench import Record, Row, Settings
+from conflow.results.printing import checked_format
+from conflow.scene.crowd import CrowdAvoidance
+from conflow.scene.measures import leaves_workspace, path_length, smoothness
+from conflow.scene.settings import Box
+from conflow.scene.tasks.crowd import CrowdTask
+from conflow.tracking import store
+from conflow.tracking.recording import hardware
+from conflow.training.build import MOMENTUM, build_source, build_task, descending, random_stream
+from conflow.training.config import Config, load
+from conflow.training.metrics import EnergyDistance
+from conflow.training.model import NONE, ConFlow
+from conflow.training.model_file import MODEL_FILE, load_model
+from conflow.training.progress import ProgressDisplay
+
+ENDS = 1e-5
+"""Within this of its start and goal, in workspace units, a plan reaches them."""
+ADHERENCE = 0.1
+"""A waypoint this near to the straight line, as a share of its length, keeps to it (MMD's measure for empty maps)."""
+GOAL = 0.05
+"""Within this of their goals robots have arrived, in simulations (as published)."""
+ORCA_STEP, ORCA_SPEED, ORCA_JITTER = 0.05, 0.6, 1e-3
+"""Seconds of a simulated step; the top speed, that of demonstrations; and how much of it is chance."""
+CORNER = 4
+"""Corners of the polygon that a rounded corner becomes."""
+AT_MOST = 2000
+"""Single robots' trajectories that the energy distance is taken of."""
+
+Propose = Callable[[CrowdTask, Tensor, int, int], Tensor]
+"""Candidates (num, T, D) for the task in a scene, start and goal (2, D), how many, and a seed."""
+Solve = Callable[[CrowdTask, Tensor, int], tuple[Tensor | None, float]]
+"""A feasible plan (T, D), or None, and the seconds it took, for the task in a scene, start and goal, and a seed."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """What solves scenes.
+
+    Attributes:
+        name: in tables.
+        solve: a scene.
+        propose: what it descends from, where it does.
+        raw: the same without guidance.
+    """
+
+    name: str
+    solve: Solve
+    propose: Propose | None = None
+    raw: Propose | None = None
+
+
+def of_model(name: str, model: ConFlow, task: CrowdTask, settings: Settings) -> Method:
+    """Candidates of a trained model: its flow, from its own source, with guidance where `settings` asks for it."""
+    sized = model.of_numbers(task.robots.D)
+
+    def sampled(setting: str) -> Propose:
+        def propose(_: CrowdTask, ends: Tensor, num: int, seed: int) -> Tensor:
+            y = ends.expand(num, -1, -1)
+            x_0 = sized.source.sample(y, random_stream("planbench", seed))
+            return exact(sized.source, sized.flow(x_0, setting, y), y)
+
+        return propose
+
+    guided, raw = sampled(next(iter(task.settings()))), sampled(NONE)
+    return Method(name, descending_from(guided if settings.guided else raw, model.config, settings), guided, raw)
+
+
+def without_model(config: Config, settings: Settings) -> Method:
+    """Candidates that are demonstrations of single robots, put together: descent does all the work."""
+
+    def propose(task: CrowdTask, ends: Tensor, num: int, seed: int) -> Tensor:
+        return task.singles(ends.expand(num, -1, -1), random_stream("planbench", seed))
+
+    return Method("descent, no model", descending_from(propose, config, settings), propose, propose)
+
+
+def descending_from(propose: Propose, config: Config, settings: Settings) -> Solve:
+    """Candidates descend until one of them is feasible; after a while others are drawn."""
+    source = build_source(config.source, CrowdTask.T)
+
+    @torch.no_grad()
+    def solve(task: CrowdTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
+        began = time.perf_counter()
+        u_c = descending(config, task, source)
+        while True:
+            states = descent(propose(task, scene, settings.num, seed), u_c, MOMENTUM)
+            for x in islice(states, 0, CHECKED * ROUNDS, CHECKED):
+                good = feasible(task, x, scene.expand(len(x), -1, -1))
+                seconds = time.perf_counter() - began
+                if bool(good.any()):
+                    return x[int(good.nonzero()[0])], seconds
+                if seconds > settings.limit:
+                    return None, seconds
+            seed += 1
+
+    return solve
+
+
+def orca(settings: Settings) -> Method:
+    """Reciprocal collision avoidance, step by step, by `pyrvo`; goals count as reached within GOAL.
+
+    In exactly symmetric scenes it deadlocks, so preferred velocities are jittered; another try follows a failed one.
+    It goes straight for the goal, and around what is in the way no farther than it sees.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    import pyrvo
+
+    def walk(task: CrowdTask, scene: Tensor, draw: np.random.Generator) -> Tensor | None:
+        count, radius = task.robots.count, task.robots.radius
+        start, goal = scene.unflatten(1, (-1, 2)).double().numpy()
+        # Half a percent more than the radius, since it lets discs touch.
+        simulator = pyrvo.RVOSimulator(ORCA_STEP, 1.0, count, 2.0, 2.0, 1.005 * radius, ORCA_SPEED)
+        for place in start.tolist():
+            simulator.add_agent(place)
+        for box in task.boxes():
+            simulator.add_obstacle(_outline(box))
+        simulator.process_obstacles()
+        at, path = start, [start]
+        for _ in range(round(2 * task.seconds / ORCA_STEP)):
+            wanted = (goal - at) / ORCA_STEP
+            speed = np.linalg.norm(wanted, axis=1, keepdims=True)
+            wanted *= np.minimum(1, ORCA_SPEED / np.maximum(speed, 1e-9))
+            wanted += ORCA_JITTER * draw.standard_normal(wanted.shape)
+            for k, velocity in enumerate(wanted.tolist()):
+                simulator.set_agent_pref_velocity(k, velocity)
+            simulator.do_step()
+            at = np.array([simulator.get_agent_position(k).to_tuple() for k in range(count)])
+            path.append(at)
+            if np.linalg.norm(goal - at, axis=1).max() <= GOAL:
+                return torch.from_numpy(np.stack(path)).flatten(1).float()
+        return None
+
+    def solve(task: CrowdTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
+        began, draw = time.perf_counter(), np.random.default_rng(seed)
+        while True:
+            x = walk(task, scene, draw)
+            seconds = time.perf_counter() - began
+            if x is not None and bool(kept(task, x[None])):
+                return x, seconds
+            if seconds > settings.limit:
+                return None, seconds
+
+    return Method("ORCA (pyrvo)", solve)
+
+
+def _outline(box: Box) -> list[list[float]]:
+    """A rounded box as a polygon around it, counterclockwise."""
+    angles = np.pi / 2 * (np.arange(CORNER) + 0.5) / CORNER
+    # As far out as keeps the edges between two corners of an arc outside it.
+    reach = box.rounding / np.cos(np.pi / 4 / CORNER)
+    points = []
+    for quarter, (sign_x, sign_y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
+        middle = [box.x + sign_x * (box.width / 2 - box.rounding), box.y + sign_y * (box.height / 2 - box.rounding)]
+        turned = angles + quarter * np.pi / 2
+        points += (np.array(middle) + reach * np.stack([np.cos(turned), np.sin(turned)], axis=1)).tolist()
+    return points
+
+
+def run(
+    config: Config,
+    models: Mapping[str, ConFlow],
+    robots: int,
+    scenes: int,
+    seed: int,
+    settings: Settings,
+    display: ProgressDisplay,
+) -> Record:
+    """Solve scenes with every method in turn, so that a busy minute of the machine is all methods' minute.
+
+    Args:
+        config: of the task, source and margin that descent without a model has; those of the first run.
+        models: by name.
+        robots: how many.
+        scenes: how many, the first of the seed's.
+        seed: of scenes and candidates.
+        settings: how scenes are solved.
+        display: for progress.
+
+    Raises:
+        ConfigError: the task is none of a crowd, or the robots find no room.
+    """
+    task = build_task(config)
+    if not isinstance(task, CrowdTask):
+        raise ConfigError(f"task={config.task}: expected a task of many robots, such as weave")
+    task = task.of_numbers(2 * robots)
+    assert isinstance(task, CrowdTask)
+    try:
+        asked = [(task.in_scene(robots, seed, i), task.scene(robots, seed, i)) for i in range(scenes)]
+    except ValueError as error:
+        raise ConfigError(f"task {config.task}: {error}") from None
+    methods = [without_model(config, settings)]
+    methods += [of_model(name, model, task, settings) for name, model in models.items()]
+    with suppress(ModuleNotFoundError):  # named as missing where the table is printed
+        methods.append(orca(settings))
+    rows, plans = [Row(method.name) for method in methods], [list[Tensor]() for _ in methods]
+    bar = display.add(f"{config.task} {robots}", scenes)
+    for index, (made, scene) in enumerate(asked):
+        for i in range(len(methods)):
+            k = (i + index) % len(methods)  # none is always the first
+            plan, seconds = methods[k].solve(made, scene, 1000 * index)
+            rows[k].seconds.append(seconds)
+            rows[k].passed.append(plan is not None)
+            plans[k] += [] if plan is None else [plan]
+        display.update(bar, index + 1, "solved " + ", ".join(str(row.solved) for row in rows))
+    # Of other scenes, so that nothing of theirs is in the plans.
+    others = [(task.in_scene(robots, seed + 1, i), task.scene(robots, seed + 1, i)) for i in range(scenes)]
+    singles = [
+        made.singles(scene[None], random_stream("planbench law", seed, i)) for i, (made, scene) in enumerate(others)
+    ]
+    law = _by_robot(torch.cat(singles))[:AT_MOST]
+    for method, row, found in zip(methods, rows, plans, strict=True):
+        _look(row, method, asked[: settings.looked], settings.num)
+        _measure(row, task, found, law)
+    shown = next((found[0] for found in reversed(plans) if found and len(found[0]) == task.T), torch.empty(0, 0))
+    rounded = [[round(value, 4) for value in waypoint] for waypoint in shown.tolist()]
+    return Record(config.task, robots, seed, asdict(settings), hardware(), rows, rounded)
+
+
+def feasible(task: CrowdTask, x: Tensor, ends: Tensor) -> Tensor:
+    """The audit: nothing touches on the way, straight from waypoint to waypoint; inside; ends reached; (batch,)."""
+    at_ends = (x[:, [0, -1]] - ends).abs().flatten(1).amax(dim=1) <= ENDS
+    return at_ends & kept(task, x)
+
+
+def kept(task: CrowdTask, x: Tensor) -> Tensor:
+    """Whether trajectories (batch, any T, D) keep all that the task asks for, and stay inside, boolean (batch,)."""
+    clearances = [one.swept_clearance(x).amin(dim=1) for one in task.constraints().values()]
+    return ~leaves_workspace(x) & (torch.stack(clearances).amin(dim=0) >= 0)
+
+
+@torch.no_grad()
+def _look(row: Row, method: Method, asked: Sequence[tuple[CrowdTask, Tensor]], num: int) -> None:
+    """What candidates are worth before descent."""
+    if method.propose is None or method.raw is None:
+        return
+    conflicts: list[float] = []
+    for index, (task, scene) in enumerate(asked):
+        y = scene.expand(num, -1, -1)
+        guided, raw = (propose(task, scene, num, 1000 * index) for propose in (method.propose, method.raw))
+        row.guided_feasible += int(feasible(task, guided, y).sum())
+        row.raw_feasible += int(feasible(task, raw, y).sum())
+        conflicts += (CrowdAvoidance(task.robots).clearances(raw).amin(dim=1) < 0).sum(dim=1).tolist()
+    row.raw = row.guided = num * len(asked)
+    row.conflicts = mean(conflicts)
+
+
+def _measure(row: Row, task: CrowdTask, plans: Sequence[Tensor], law: Tensor) -> None:
+    """How good the plans of solved scenes are, and how far from single robots' (n, T, 2).
+
+    Those of a simulation last as long as they do, so only their paths are measured.
+    """
+    if not plans:
+        return
+    row.path_length = median(float(path_length(task.robots, x[None])) for x in plans)
+    row.adherence = mean(float((_from_line(_by_robot(x[None])) <= ADHERENCE).float().mean()) for x in plans)
+    if any(len(x) != task.T for x in plans):
+        return
+    x = torch.stack(list(plans))
+    row.smoothness = float(smoothness(task.robots, x).median())
+    distance = EnergyDistance(law)
+    distance.update(_by_robot(x)[:AT_MOST])
+    found = distance.compute()
+    row.energy_distance = [found[f"energy_distance{part}"] for part in ("", "_low", "_high")]
+
+
+def _by_robot(x: Tensor) -> Tensor:
+    """Trajectories (batch, T, D) of single robots, (batch robots, T, 2)."""
+    return x.unflatten(2, (-1, 2)).transpose(1, 2).flatten(0, 1)
+
+
+def _from_line(x: Tensor) -> Tensor:
+    """How far waypoints of trajectories (batch, T, 2) are from the straight line, in its lengths, (batch, T)."""
+    start, travel = x[:, :1], x[:, -1:] - x[:, :1]
+    away = x - start
+    cross = away[..., 0] * travel[..., 1] - away[..., 1] * travel[..., 0]
+    return cross.abs() / travel.square().sum(dim=2)
+
+
+def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Console) -> None:
+    """Run the benchmark as the command line asks, print, write and draw what came of it; or print what is of record.
+
+    Args:
+        options: task, n, scenes, run, seed, num, limit, guided, format, reference and out.
+        arguments: settings `sample....=value` of the models.
+        console: for progress and the table.
+
+    Raises:
+        ConfigError: an option that cannot be used, or a run of another task.
+    """
+    form = checked_format(options["format"])
+    if commandline.whole(options, "reference", 0, 1):
+        results.render(results.of_reference(), form, console)
+        return
+    robots, scenes = commandline.whole(options, "n", 2, 1000), commandline.whole(options, "scenes", 1, 10**5)
+    seed, num = commandline.whole(options, "seed", 0, 2**32 - 1), commandline.whole(options, "num", 1, 10**4)
+    guided = commandline.whole(options, "guided", 0, 1) == 1
+    settings = Settings(num, commandline.number(options, "limit"), guided)
+    models = {}
+    for name in [] if options["run"] == "none" else options["run"].split(","):
+        model = load_model(store.artifact(store.find_run(name), MODEL_FILE), arguments)
+        if model.config.task != options["task"]:
+            raise ConfigError(f"run={name}: is of task {model.config.task}, expected one of {options['task']}")
+        sample = model.config.sample
+        models[f"{model.config.ablation}-s{model.config.seed}, {sample.steps} steps{', guided' * guided}"] = model
+    with ProgressDisplay(console) as display:
+        config = next((model.config for model in models.values()), load([f"task={options['task']}", "ablation=plus"]))
+        record = run(config, models, robots, scenes, seed, settings, display)
+    results.render([record], form, console)
+    path = results.write(record, Path(options["out"]))
+    picture = path.with_suffix(".png")
+    success(record.task, record.robots, {row.method: (row.seconds, row.passed) for row in record.rows}, picture)
+    task = build_task(load([f"task={record.task}"])).of_numbers(2 * robots)
+    assert isinstance(task, CrowdTask)
+    if record.plan:
+        boxes = task.in_scene(robots, seed, 0).boxes()
+        animation(torch.tensor(record.plan), task.robots.radius, boxes, path.with_suffix(".gif"))
+    print(f"Written: {path}, and pictures beside it", file=sys.stderr)

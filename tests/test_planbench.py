@@ -1,0 +1,226 @@
+"""Plans for many robots: by the planner for any number of them, and scene by scene in `make planbench`."""
+
+import importlib.util
+import json
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.patches import FancyBboxPatch
+from rich.console import Console
+
+from conflow import planbench
+from conflow.errors import ConfigError
+from conflow.figures import workspace
+from conflow.figures.planbench import animation, success
+from conflow.planner import PlanError, Planner
+from conflow.results import peers
+from conflow.results import planbench as results
+from conflow.results.planbench import Record, Settings
+from conflow.results.printing import Format
+from conflow.scene.settings import Box
+from conflow.scene.tasks import CROWDS
+from conflow.scene.tasks.crowd import CrowdTask
+from conflow.training import config
+from conflow.training.build import build_task
+from conflow.training.datamodule import DemonstrationData
+from conflow.training.model import ConFlow
+from conflow.training.progress import ProgressDisplay
+
+SETTINGS = config.load(["task=weave", "ablation=plus", "preset=smoke", "task.robots=[6, 8]"])
+
+
+@pytest.fixture(scope="module")
+def model() -> ConFlow:
+    """Not trained, so it flows as its source does: to curves that know nothing of each other."""
+    torch.manual_seed(0)
+    return ConFlow(SETTINGS, build_task(SETTINGS)).eval()
+
+
+@pytest.fixture(scope="module")
+def weave() -> CrowdTask:
+    return CROWDS["weave"](8)
+
+
+@pytest.mark.parametrize("count", [5, 8, 12])
+def test_a_planner_takes_any_number_of_robots(model: ConFlow, count: int) -> None:
+    """With the same weights, also more than training saw."""
+    start, goal = CROWDS["weave"](count).scene(count, 0, 0)
+    plans = Planner(model).plan(start, goal, num=6, descent=40)
+    assert plans.x.shape == (6, 64, 2 * count)
+    assert torch.equal(plans.x[:, [0, -1]], torch.stack([start, goal]).expand(6, -1, -1))
+    assert bool(plans.feasible[0])
+    sized = model.of_numbers(2 * count)
+    weights = zip(sized.v.parameters(), model.v.parameters(), strict=True)
+    assert all(ours.data_ptr() == theirs.data_ptr() for ours, theirs in weights)
+
+
+def test_descent_makes_plans_feasible_and_is_the_runs_own_by_default(model: ConFlow) -> None:
+    start, goal = CROWDS["weave"](14).scene(14, 0, 1)
+    raw, own, longer = (Planner(model).plan(start, goal, 16, guidance="none", descent=k) for k in (0, None, 60))
+    assert SETTINGS.sample.descent > 0
+    assert int(raw.feasible.sum()) < int(own.feasible.sum()) <= int(longer.feasible.sum())
+    with pytest.raises(PlanError, match=r"^descent=-1: expected a whole number of at least 0$"):
+        Planner(model).plan(start, goal, descent=-1)
+
+
+def test_descent_keeps_obstacles_and_via_points_too(model: ConFlow) -> None:
+    start, goal = CROWDS["weave"](8).scene(8, 0, 1)
+    obstacle, via = (0.1, 0.1, 0.12), CROWDS["circle"](8).scene(8, 0, 0)[0]
+    plans = Planner(model).plan(start, goal, 16, [obstacle], [(0.3, via)], descent=80)
+    assert torch.equal(plans.x[:, round(0.3 * 63)], via.expand(16, -1))
+    assert bool(plans.feasible[0])
+    distance = (plans.x[0].unflatten(1, (-1, 2)) - torch.tensor(obstacle[:2])).norm(dim=2)
+    assert float(distance.min()) >= 0.12 + 0.05 - 1e-6
+
+
+def test_the_best_of_candidates_is_there_as_soon_as_one_is_feasible(model: ConFlow) -> None:
+    start, goal = CROWDS["weave"](8).scene(8, 0, 2)
+    seen: list[float] = []
+    best = Planner(model).best_of(start, goal, num=8, progress=lambda seconds, clearance: seen.append(clearance))
+    assert best.x.shape == (1, 64, 16)
+    assert bool(best.feasible[0])
+    assert seen == sorted(seen)
+    assert all(clearance < 0 for clearance in seen[:-1])
+    assert seen[-1] == float(best.clearance[0]) >= 0
+
+
+def test_without_a_feasible_one_the_nearest_to_it_comes_when_time_is_up(model: ConFlow) -> None:
+    start, goal = CROWDS["weave"](8).scene(8, 0, 2)
+    best = Planner(model).best_of(start, goal, num=2, seconds=0)
+    assert best.x.shape == (1, 64, 16)
+    assert bool(best.feasible[0]) == (float(best.clearance[0]) >= 0)
+
+
+def test_the_audit_sees_what_happens_between_waypoints_and_at_the_ends(weave: CrowdTask) -> None:
+    scene = weave.scene(8, 0, 0)
+    line = torch.lerp(scene[None, :1], scene[None, 1:], torch.linspace(0, 1, 64)[None, :, None])
+    parked = scene[:1].expand(1, 64, -1).clone()
+    still = torch.stack([scene[0], scene[0]])[None]
+    assert planbench.feasible(weave, parked, still).tolist() == [True]
+    assert planbench.feasible(weave, line, scene[None]).tolist() == [False]
+    jumping = parked.clone()
+    jumping[:, 30:, :2] = -parked[:, 30:, :2]  # through the middle in one step, to where nobody is
+    jumping[:, :, 2:4], jumping[:, :, 4:] = 0.0, torch.linspace(0.6, 0.9, 12)
+    at_waypoints = weave.constraints()["robot"].clearances(jumping)[:, :, 0]
+    assert (at_waypoints > 0).all()
+    assert planbench.kept(weave, jumping).tolist() == [False]
+    moved = parked.clone()
+    moved[:, -1, 0] += 2e-5
+    assert planbench.feasible(weave, moved, still).tolist() == [False]
+    outside = parked.clone()
+    outside[:, 20:40, 0] = 1.01
+    assert planbench.feasible(weave, outside, still).tolist() == [False]
+
+
+@pytest.fixture(scope="module")
+def record(model: ConFlow) -> Record:
+    settings = Settings(num=4, limit=20.0, looked=2)
+    with ProgressDisplay(Console(quiet=True)) as display:
+        return planbench.run(SETTINGS, {"ours": model}, 8, 3, seed=1, settings=settings, display=display)
+
+
+def test_every_method_is_asked_the_same_scenes(record: Record) -> None:
+    names = ["descent, no model", "ours", *(["ORCA (pyrvo)"] if importlib.util.find_spec("pyrvo") else [])]
+    assert [row.method for row in record.rows] == names
+    for row in record.rows:
+        assert row.scenes == len(row.seconds) == 3
+        assert row.solved == 3
+        assert row.path_length is not None
+        assert 1.7 < row.path_length < 3  # the straight line has 1.74
+    none, ours, *_ = record.rows
+    assert (ours.raw, ours.guided, none.raw) == (8, 8, 8)
+    assert none.raw_feasible == none.guided_feasible
+    assert none.conflicts is not None
+    assert none.conflicts > 0
+    assert ours.guided_feasible >= ours.raw_feasible
+
+
+def printed(records: list[Record], form: Format) -> str:
+    console = Console(width=300)
+    with console.capture() as captured:
+        results.render(records, form, console)
+    return captured.get()
+
+
+def test_a_record_is_read_as_it_was_written_and_none_is_overwritten(record: Record, tmp_path: Path) -> None:
+    paths = [results.write(record, tmp_path / "planbench") for _ in range(2)]
+    assert [path.name for path in paths] == ["weave-8.json", "weave-8-2.json"]
+    assert [results.read(path) for path in paths] == [record, record]
+    paths[0].write_text("{}")
+    with pytest.raises(ConfigError, match=r"weave-8\.json: expected a record of make planbench, found"):
+        results.read(paths[0])
+
+
+def test_a_record_is_printed_in_every_form(record: Record) -> None:
+    row = next(line for line in printed([record], "table").splitlines() if "descent, no model" in line)
+    assert "3/3 [0.439, 1.000]" in row
+    assert f"{mean(record.rows[0].seconds):.3f}" in row
+    assert "| descent, no model | 3/3 [0.439, 1.000] |" in printed([record], "markdown")
+    assert json.loads(printed([record], "json"))[0]["rows"][0]["passed"] == [True] * 3
+    lines = printed([record], "csv").splitlines()
+    assert lines[0] == "task,robots,scene,method,solved,seconds"
+    assert len(lines) == 1 + 3 * len(record.rows)
+
+
+def test_what_is_published_stands_apart_with_its_hardware(record: Record) -> None:
+    larger = Record("weave", 28, 1, record.settings, "here", record.rows)
+    text = printed([record, larger], "markdown")
+    assert f"| published: {peers.AKULE}, one large GPU | 512/512 | 29.9 |" in text
+    overview = text.splitlines()
+    assert "| task, robots | descent, no model | ours |" in overview[2]
+    assert overview[4].startswith("| weave, 8 | 3/3 [0.439, 1.000]<br>")
+    assert "Akule 512/512, 29.9 s<br>MMD 512/512, 82.9 s" in overview[5]
+
+
+def test_the_benchmark_is_of_crowds_that_find_room(model: ConFlow) -> None:
+    settings = Settings()
+    with ProgressDisplay(Console(quiet=True)) as display:
+        with pytest.raises(ConfigError, match=r"^task=swap: expected a task of many robots, such as weave$"):
+            planbench.run(config.load(), {}, 2, 1, 0, settings, display)
+        crowded = config.load(["task=random", "preset=smoke"])
+        with pytest.raises(ConfigError, match=r"^task random: robots=300: expected fewer"):
+            planbench.run(crowded, {}, 300, 1, 0, settings, display)
+
+
+@pytest.mark.parametrize(
+    ("option", "said"), [("n=1", "n=1: expected"), ("scenes=0", "scenes=0: expected"), ("limit=x", "limit=x: expected")]
+)
+def test_an_option_that_cannot_be_used_is_named(option: str, said: str) -> None:
+    key, value = option.split("=")
+    options = {"task": "weave", "n": "8", "scenes": "2", "run": "x", "seed": "0", "num": "2", "limit": "1"}
+    options |= {"guided": "0", "format": "table", "reference": "0", "out": "none", key: value}
+    with pytest.raises(ConfigError) as refused:
+        planbench.planbench(options, [], Console(quiet=True))
+    assert str(refused.value).startswith(said)
+
+
+def test_what_is_solved_is_drawn_against_time_and_one_plan_in_motion(record: Record, tmp_path: Path) -> None:
+    success("weave", 8, {row.method: (row.seconds, row.passed) for row in record.rows}, tmp_path / "success.png")
+    success("weave", 8, {"none": ([1.0, 2.0], [False, False])}, tmp_path / "unsolved.png")
+    animation(
+        torch.tensor(record.plan), 0.05, [Box(0, 0, 0.8, 0.1, 0.015), Box(0.5, 0.5, 0.2, 0.2)], tmp_path / "plan.gif"
+    )
+    for name in ("success.png", "unsolved.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "plan.gif").read_bytes().startswith(b"GIF89a")
+    assert (tmp_path / "plan.gif").stat().st_size < 500_000
+    assert np.array(record.plan).shape == (64, 16)
+
+
+def test_a_map_is_drawn_where_trajectories_are(tmp_path: Path) -> None:
+    settings = config.load(["task=shelf", "preset=smoke", "task.robots=3", "data.num=20"])
+    figure = workspace.demonstrations(DemonstrationData(settings))
+    boxes = CROWDS["shelf"](3).boxes()
+    for axis in figure.axes:
+        drawn = [patch for patch in axis.patches if isinstance(patch, FancyBboxPatch)]
+        assert len(drawn) == len(boxes) == 12
+        for patch, box in zip(drawn, boxes, strict=True):
+            around = patch.get_path().get_extents(patch.get_transform() - axis.transData)
+            np.testing.assert_allclose(
+                [around.x0, around.y0, around.x1, around.y1],
+                [box.x - 0.1768, box.y - 0.1768, box.x + 0.1768, box.y + 0.1768],
+                atol=1e-3,
+            )
