@@ -2,8 +2,10 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import numpy as np
 import pytest
@@ -224,3 +226,15 @@ def test_a_map_is_drawn_where_trajectories_are(tmp_path: Path) -> None:
                 [box.x - 0.1768, box.y - 0.1768, box.x + 0.1768, box.y + 0.1768],
                 atol=1e-3,
             )
+
+
+def test_the_readme_s_lines_plan_for_28_robots(model: ConFlow, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With whatever model: this one was not trained."""
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    (lines,) = re.findall(r"```python\n(from conflow import Planner\n.*?)```", text, re.DOTALL)
+    assert len(lines.splitlines()) <= 10
+    monkeypatch.setattr(Planner, "load", classmethod(lambda cls, run: cls(model)))
+    known: dict[str, Any] = {}
+    exec(lines, known)
+    assert known["plans"].x.shape == (1, 64, 56)
+    assert bool(known["plans"].feasible[0])

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from conflow.results import comparison, printing
+from conflow.results import comparison, planbench, printing
 from tests.bench import suite, table
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path("runs/reference")
 PAGES = [Path("README.md"), REFERENCE / "FINDINGS.md", REFERENCE / "BENCH.md"]
-LENGTH, WIDTH = 200, 120
+LENGTH, WIDTH = 220, 120
 """Lines of the README, and characters of a line outside tables."""
 TITLED = re.compile(r"^\*\*.+\*\*\n\n(?:\|.*\n)+", re.MULTILINE)
 """A table in Markdown under its title."""
@@ -25,17 +25,18 @@ def root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
 
 
-def test_every_titled_table_is_printed_by_make_compare_or_make_bench() -> None:
-    """Printed by: make compare REFERENCE=1 FORMAT=markdown, make bench REFERENCE=1 FORMAT=markdown."""
+def test_every_titled_table_is_printed_by_a_command() -> None:
+    """Printed by: make compare REFERENCE=1 FORMAT=markdown, and likewise make bench and make planbench."""
     console = Console()
     with console.capture() as captured:
         printing.render(comparison.collect_reference(), "markdown", console)
         table.render(suite.Bench.read(suite.REFERENCE), "markdown", console)
+        planbench.render(planbench.of_reference(), "markdown", console)
     printed = TITLED.findall(captured.get())
     shown = {page: TITLED.findall(page.read_text()) for page in PAGES}
     assert [one for tables in shown.values() for one in tables if one not in printed] == []
     readme, _, bench = PAGES
-    assert len(shown[readme]) == 1
+    assert len(shown[readme]) == 2
     assert len(shown[bench]) > 5
 
 
@@ -45,6 +46,14 @@ def test_the_tables_of_record_are_what_make_compare_prints() -> None:
     with console.capture() as captured:
         printing.render(comparison.collect_reference(), "markdown", console)
     assert (REFERENCE / "TABLES.md").read_text() == captured.get()
+
+
+def test_the_scenes_of_record_are_what_make_planbench_prints() -> None:
+    """Written by: make planbench REFERENCE=1 FORMAT=markdown > runs/reference/PLANBENCH.md."""
+    console = Console()
+    with console.capture() as captured:
+        planbench.render(planbench.of_reference(), "markdown", console)
+    assert (REFERENCE / "PLANBENCH.md").read_text() == captured.get()
 
 
 def test_the_readme_is_one_page() -> None:

@@ -122,6 +122,26 @@ def test_a_task_of_ones_own_has_a_column_for_each_setting_and_constraint(folder:
     assert {c.table for c in found.cells} == {"1", "3"}
 
 
+def test_a_crowd_has_a_column_for_what_descent_refined_too(folder: Path) -> None:
+    for seed in range(2):
+        made = published("plus", seed, 0, "task=weave")
+        assert made.changes == []
+        metrics: dict[str, float] = {}
+        for setting in ("none", "robot", "refined"):
+            metrics |= {f"test/{setting}/num": 100, f"test/{setting}/robot_collision_count": 7 + seed}
+        replace(made, metrics=metrics).write(records.FOLDER)
+    (found,) = comparison.collect_reference()
+    assert [c.column for c in found.cells if c.table == "1"] == ["none: robot", "refined: robot", "robot: robot"]
+    assert found.claims == []
+
+
+def test_what_a_task_was_made_with_is_a_change_and_in_the_command(folder: Path) -> None:
+    made = published("plus", 0, 0, "task=weave", "task.robots=[10, 20]")
+    assert made.changes == ["task.robots=[10, 20]"]
+    (found,) = comparison.collect_reference()
+    assert any("TASK=weave ARGS='task.robots=[10,20]'" in command for command in found.commands.values())
+
+
 def test_records_of_several_tasks_are_compared_apart(folder: Path) -> None:
     """Of one ablation at one preset, changed or not: the paper's task first, the rows of others named by theirs."""
     (folder / "my_task.py").write_text("x = 1\n")

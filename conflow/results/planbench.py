@@ -168,7 +168,8 @@ def _attempts(records: Sequence[Record]) -> list[Attempt]:
 
 def _overview(records: Sequence[Record]) -> Sheet:
     """Every record in a line: who solved how many scenes, and how soon on average."""
-    methods = list(dict.fromkeys(_kind(row.method) for record in records for row in record.rows))
+    methods = dict.fromkeys(_kind(row.method) for record in records for row in record.rows)
+    methods = dict.fromkeys(sorted(methods, key=lambda method: method.startswith("ORCA")))
     rows = []
     for record in records:
         own = {_kind(row.method): f"{_solved(row)}\n{mean(row.seconds):.3f} s" for row in record.rows}

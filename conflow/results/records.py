@@ -12,7 +12,7 @@ from mlflow.entities import Run
 from conflow.errors import ConfigError
 from conflow.tracking import code, recording, store
 from conflow.training import config
-from conflow.training.config import PAPERS_TASK, SPLITS, SplitName, flatten
+from conflow.training.config import OF_TASK, PAPERS_TASK, SPLITS, SplitName, flatten
 from conflow.training.evaluation import EVALUATED_ON_VALIDATION
 
 FOLDER = store.RUNS / "reference" / "runs"
@@ -111,7 +111,12 @@ class Record:
         """The settings that are not those of the task and the ablation at the preset, as arguments."""
         axes = [f"ablation={self.ablation}", f"preset={self.preset}", f"seed={self.seed}"]
         named = flatten(config.load([*axes, *self.of_task]).tree()) | {"task": self.task}
-        changed = {key: value for key, value in self.settings.items() if value != str(named.get(key, value))}
+        # A setting that came later counts as its default; one of the task's own is never there by default.
+        changed = {
+            key: value
+            for key, value in self.settings.items()
+            if value != str(named.get(key, None if key.startswith(OF_TASK) else value))
+        }
         return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
 
     @property

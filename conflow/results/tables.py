@@ -10,7 +10,7 @@ from statistics import fmean
 from conflow.results import paper, statistics
 from conflow.results.records import Record
 from conflow.results.statistics import Score, Seed
-from conflow.training.config import PAPERS_TASK
+from conflow.training.config import PAPERS_TASK, SWAPS
 from conflow.training.metrics import wilson
 
 METHODS = {
@@ -155,9 +155,9 @@ def tables(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]
 
 
 def collisions(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
-    """The columns of collision rates: the paper's, or of a task of its own each setting with each constraint."""
+    """The columns of collision rates: the paper's, or of another task's each setting with each constraint."""
     every = [run for by_seed in runs.values() for run in by_seed]
-    if not every or every[0].of_task:  # the tasks that come with the program have the paper's constraints
+    if not every or every[0].task in SWAPS:
         return COLLISIONS
     found = (re.fullmatch(r"test/([^/]+)/(.+)_collision_count", key) for run in every for key in run.metrics)
     names = sorted({(one[1] != "none", one[1], one[2]) for one in found if one})
