@@ -207,11 +207,7 @@ def run(
     Raises:
         ConfigError: the task is none of a crowd, or the robots find no room.
     """
-    task = build_task(config)
-    if not isinstance(task, CrowdTask):
-        raise ConfigError(f"task={config.task}: expected a task of many robots, such as weave")
-    task = task.of_numbers(2 * robots)
-    assert isinstance(task, CrowdTask)
+    task = crowd(config, robots)
     try:
         asked = [(task.in_scene(robots, seed, i), task.scene(robots, seed, i)) for i in range(scenes)]
     except ValueError as error:
@@ -242,6 +238,19 @@ def run(
     shown = next((found[0] for found in reversed(plans) if found and len(found[0]) == task.T), torch.empty(0, 0))
     rounded = [[round(value, 4) for value in waypoint] for waypoint in shown.tolist()]
     return Record(config.task, robots, seed, asdict(settings), hardware(), rows, rounded)
+
+
+def crowd(config: Config, robots: int) -> CrowdTask:
+    """The task that the config names, with so many robots.
+
+    Raises:
+        ConfigError: it is not one of many robots.
+    """
+    task = build_task(config)
+    made = task.of_numbers(2 * robots)
+    if not isinstance(made, CrowdTask):
+        raise ConfigError(f"task={config.task}: expected a task of many robots, such as weave")
+    return made
 
 
 def feasible(task: CrowdTask, x: Tensor, ends: Tensor) -> Tensor:
@@ -323,6 +332,8 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
     seed, num = commandline.whole(options, "seed", 0, 2**32 - 1), commandline.whole(options, "num", 1, 10**4)
     guided = commandline.whole(options, "guided", 0, 1) == 1
     settings = Settings(num, commandline.number(options, "limit"), guided)
+    named = load([f"task={options['task']}", "ablation=plus"])
+    task = crowd(named, robots)
     models = {}
     for name in [] if options["run"] == "none" else options["run"].split(","):
         model = load_model(store.artifact(store.find_run(name), MODEL_FILE), arguments)
@@ -331,14 +342,12 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
         sample = model.config.sample
         models[f"{model.config.ablation}-s{model.config.seed}, {sample.steps} steps{', guided' * guided}"] = model
     with ProgressDisplay(console) as display:
-        config = next((model.config for model in models.values()), load([f"task={options['task']}", "ablation=plus"]))
+        config = next((model.config for model in models.values()), named)
         record = run(config, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)
     path = results.write(record, Path(options["out"]))
     picture = path.with_suffix(".png")
     success(record.task, record.robots, {row.method: (row.seconds, row.passed) for row in record.rows}, picture)
-    task = build_task(load([f"task={record.task}"])).of_numbers(2 * robots)
-    assert isinstance(task, CrowdTask)
     if record.plan:
         boxes = task.in_scene(robots, seed, 0).boxes()
         animation(torch.tensor(record.plan), task.robots.radius, boxes, path.with_suffix(".gif"))
