@@ -19,6 +19,7 @@ from conflow.scene.tasks import TASKS
 from conflow.scene.tasks.swap import Swap
 from conflow.training import config
 from conflow.training.build import build_task, file_of, task_of_file
+from conflow.training.model_file import load_model
 from conflow.training.module import Training
 
 
@@ -236,6 +237,21 @@ def test_a_file_s_task_is_made_with_settings_of_its_own(tmp_path: Path) -> None:
     assert settings.sha() != config.load([f"task={path}"]).sha()
     with pytest.raises(ConfigError, match=r"^task\.widht=2: no such setting of task mine, expected one of width, lab"):
         build_task(config.load([f"task={path}", "task.widht=2"]))
+
+
+def test_a_run_is_loaded_with_the_settings_that_its_task_was_made_with(tmp_path: Path) -> None:
+    """And one from before there was a setting has its default."""
+    path = tmp_path / "mine.py"
+    path.write_text(COMPLETE + "    def __init__(self, width: float = 1.0): self.width = width\n")
+    settings = config.load([f"task={path}", "ablation=plus", "preset=smoke", "task.width=2"])
+    trained = Training(settings, build_task(settings))
+    checkpoint: dict[str, Any] = {"state_dict": trained.state_dict()}
+    trained.on_save_checkpoint(checkpoint)
+    del checkpoint["conflow"]["config"]["sample"]["descent"]
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    model = load_model(tmp_path / "model.ckpt", task=task_of_file(path))
+    assert vars(model.task)["width"] == 2
+    assert model.config == settings
 
 
 @pytest.mark.parametrize("offset", [np.float32(3), np.array([3.0, -2.0]), torch.tensor([3.0, -2.0]), (3, -2.0), 3])

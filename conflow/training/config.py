@@ -269,6 +269,21 @@ def from_tree(tree: Any) -> Config:
     return config
 
 
+def completed(tree: Tree) -> Tree:
+    """What `Config.tree` wrote at some time, with the defaults of settings that came later."""
+
+    def over(defaults: Tree, own: Any) -> Any:
+        if not isinstance(own, dict):
+            return own  # which `from_tree` refuses
+        nested = {
+            key: over(value, own[key]) for key, value in defaults.items() if isinstance(value, dict) and key in own
+        }
+        return defaults | own | nested
+
+    found: Tree = over(_read("base"), tree)
+    return found
+
+
 def _built(cls: type, tree: Any, prefix: str = "") -> Any:
     """The dataclass of a tree of plain values, without OmegaConf, which takes its time."""
     hints = {name: kind for name, kind in get_type_hints(cls).items() if kind != Tree}

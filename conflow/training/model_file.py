@@ -8,7 +8,7 @@ from conflow.scene.task import Task
 from conflow.scene.tasks import TASKS
 from conflow.tracking import checkpoint_file
 from conflow.training import config as configuration
-from conflow.training.build import build_task
+from conflow.training.build import build_task, made
 from conflow.training.model import ConFlow
 
 MODEL_FILE = "model.ckpt"
@@ -35,7 +35,7 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
     """
     checkpoint = checkpoint_file.load(path)
     described = checkpoint["conflow"]
-    config = configuration.from_tree(described["config"])
+    config = configuration.from_tree(configuration.completed(described["config"]))
     if arguments:
         config = configuration.override(config, arguments, SAMPLING)
     T, D = described["T"], described["D"]
@@ -44,7 +44,9 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
     elif task is None:
         expected = f"expected the file or the object of task {config.task_name}, which no checkpoint holds"
         raise TaskError(f"task: {expected}; try: task={Path(config.task).name}")
-    elif task.T != T or task.robots.D != D:
+    elif config.of_task:  # a file's, made anew as the run's was
+        task = made(type(task), task.name, config.of_task)
+    if task.T != T or task.robots.D != D:
         expected = f"expected T={T} and D={D}, as the run of task {config.task_name} has"
         raise TaskError(f"task={task.name}: found T={task.T} waypoints of D={task.robots.D} numbers, {expected}")
     task.scale, task.offset = described["scale"], described["offset"]
