@@ -158,8 +158,10 @@ def test_a_small_step_along_the_gradient_improves_a_colliding_trajectory(
     x = x[constraint.violation(x)]
     g = constraint.gradient(x)
     growth = constraint.barrier(x + eta * g) - constraint.barrier(x)
-    # The second order in eta, with curvatures gamma and 1 / |w|, and as much of rounding.
-    torch.testing.assert_close(growth, eta * (g**2).sum(dim=(1, 2)), rtol=1e-5, atol=0)
+    # The second order in eta, with curvatures gamma and 1 / |w|, and as much of rounding; where bodies hardly overlap
+    # the slope of the square is next to nothing, and rounding of the clearance is seen.
+    atol = 1e-18 if shape == "square" else 0.0
+    torch.testing.assert_close(growth, eta * (g**2).sum(dim=(1, 2)), rtol=1e-5, atol=atol)
 
 
 @pytest.mark.parametrize("waypoint", [0, 2, 4])

@@ -407,11 +407,8 @@ def test_the_command_never_overwrites(demonstrations: Run) -> None:
         ("out=no/passing.npz", "out=no/passing.npz: No such file or directory, expected a new file in an existing fol"),
         ("out=passing.csv", "out=passing.csv: expected a name that ends in .npz"),
         (f"out={'a' * 300}.npz", f"out={'a' * 300}.npz: File name too long, expected"),
-        (
-            "task=socal",
-            "task=socal: expected one of circle, conveyor, highways, passing, random, room, shelf, social, swap, weave",
-        ),
-        ("task=", "task=: expected one of circle, conveyor, highways, passing, random, room"),
+        ("task=socal", "task=socal: expected one of basic, circle, conveyor, dense, highways, passing, random, room, "),
+        ("task=", "task=: expected one of basic, circle, conveyor, dense, highways, passing, random, room, "),
         ("num=9", "num=9: expected a whole number of at least 10 and at most 100000"),
         ("num=many", "num=many: expected a whole number"),
         ("seed=-1", "seed=-1: expected a whole number of at least 0"),

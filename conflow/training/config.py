@@ -37,6 +37,8 @@ SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
 
 OF_TASK = "task."
 """Begins the settings that are a task's own."""
+LATER: dict[str, Tree] = {"sample": {"descent": 0}}
+"""Settings that earlier runs lack, with their defaults: here, since a planner reads no YAML."""
 SIZES = (
     "data.num",
     "network.hidden",
@@ -269,19 +271,12 @@ def from_tree(tree: Any) -> Config:
     return config
 
 
-def completed(tree: Tree) -> Tree:
-    """What `Config.tree` wrote at some time, with the defaults of settings that came later."""
-
-    def over(defaults: Tree, own: Any) -> Any:
-        if not isinstance(own, dict):
-            return own  # which `from_tree` refuses
-        nested = {
-            key: over(value, own[key]) for key, value in defaults.items() if isinstance(value, dict) and key in own
-        }
-        return defaults | own | nested
-
-    found: Tree = over(_read("base"), tree)
-    return found
+def completed(tree: Any) -> Any:
+    """What `Config.tree` wrote at some time, with the defaults of the settings that came later."""
+    if not isinstance(tree, dict):
+        return tree  # which `from_tree` refuses
+    groups = {key: value for key, value in tree.items() if isinstance(value, dict)}
+    return tree | {group: defaults | groups[group] for group, defaults in LATER.items() if group in groups}
 
 
 def _built(cls: type, tree: Any, prefix: str = "") -> Any:
