@@ -32,7 +32,7 @@ def success(task: str, robots: int, methods: Mapping[str, Attempts], path: Path)
         axis.step(*ends, where="post", color=COLOURS[i % len(COLOURS)], label=name, lw=1.8)
     axis.set_title(f"{task}, {robots} robots, {len(next(iter(methods.values()))[0])} scenes")
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, loc="lower right", fontsize=9)
+    axis.legend(frameon=False, loc="best", fontsize=9)
     figure.savefig(path, dpi=DPI)
 
 
