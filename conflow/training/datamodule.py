@@ -179,12 +179,14 @@ class DemonstrationData(LightningDataModule):
             )
         if data.repair:
             train_split, val_split = (self._repaired(one, self.task) for one in (train_split, val_split))
+        # A correction at the predicted end says itself what is feasible; any other method has to be shown it.
+        shown = not data.negatives or self.config.correction.at != "end"
+        if shown and len(train_split.x) and bool(train_split.violates.all()):
+            raise DemonstrationError(
+                f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, and ablation "
+                f"{self.config.ablation} needs D+"
+            )
         if not data.negatives:
-            if len(train_split.x) and bool(train_split.violates.all()):
-                raise DemonstrationError(
-                    f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, and ablation "
-                    f"{self.config.ablation} needs D+"
-                )
             train_split, val_split = train_split.feasible(), val_split.feasible()
         # Of a single test trajectory there is no diversity.
         for part, split, needed in (

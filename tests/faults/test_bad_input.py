@@ -234,7 +234,7 @@ FILES: dict[str, tuple[bytes, str]] = {
     "one robot": (written(x=X[:, :, :2]), f"x has shape (N, 8, 2), {SHAPE}"),
     "two waypoints": (written(x=X[:, :2]), f"x has shape (50, 2, 4), {SHAPE}"),
     "no trajectory": (written(x=X[:0]), "x is empty, expected at least one trajectory"),
-    "one trajectory": (written(x=X[:1]), "no trajectory for training is feasible out of 1, expected D+ too"),
+    "one trajectory": (written(x=X[:1]), "no trajectory for training is feasible out of 1, and ablation cgp needs D+"),
     "three trajectories": (
         written(x=X[:3], violates=np.array([True, False, False])),
         "0 trajectories are left for validation out of 3, expected 1 or more",
@@ -257,7 +257,7 @@ FILES: dict[str, tuple[bytes, str]] = {
     "none violates": (written(x=X, violates=np.zeros(50, bool)), "no trajectory for training violates the constraint"),
     "all violate": (
         written(x=X, violates=np.ones(50, bool)),
-        "no trajectory for training is feasible out of 40, expected D+ too",
+        "no trajectory for training is feasible out of 40, and ablation cgp needs D+",
     ),
 }
 
