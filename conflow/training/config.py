@@ -181,7 +181,8 @@ def names(axis: str) -> list[str]:
 def load(arguments: Sequence[str] = ()) -> Config:
     """conf/base.yaml, then task, preset and ablation, then arguments `key=value`, checked.
 
-    A block `times` of a task or an ablation multiplies what base and preset say, so that lengths follow every preset.
+    A task's `like: FILE` is another file under conf/, over which the task's own settings are laid. A block `times` of a
+    task or an ablation multiplies what base and preset say, so that lengths follow every preset.
 
     Raises:
         ConfigError: an unknown name, a value of the wrong type or out of range.
@@ -199,6 +200,8 @@ def load(arguments: Sequence[str] = ()) -> Config:
             raise ConfigError(f"{axis}={brief(name)}: expected one of {known}{nearest(name, names(axis))}")
     check_file(chosen["task"])
     task = {} if is_file(chosen["task"]) else _read(f"task/{chosen['task']}")
+    if "like" in task:
+        task = _read(task.pop("like")) | task
     preset, ablation = (_read(f"{axis}/{chosen[axis]}") for axis in ("preset", "ablation"))
     multiplied = [
         _factors(f"conf/{axis}/{chosen[axis]}.yaml", tree.pop("times", {}))
