@@ -35,10 +35,6 @@ class Robots(ABC):
     def pullback(self, x: Tensor, g: Tensor) -> Tensor:
         """The gradient with respect to configurations x, (batch, T, D), of one g with respect to `points(x)`."""
 
-    def of_numbers(self, D: int) -> "Robots":
-        """The robots that configurations of D numbers are of: these."""
-        return self
-
     def moved(self, g: Tensor) -> Tensor:
         """Which bodies a change g (batch, T, D) of the configuration moves, boolean (batch, T, bodies); here all."""
         return torch.ones(*g.shape[:2], len(self.owner), dtype=torch.bool, device=g.device)
@@ -96,9 +92,5 @@ class Crowd(Discs):
         super().__init__(count, radius)
         self.radius = radius
 
-    def of_numbers(self, D: int) -> "Crowd":
-        """As many discs as D numbers place."""
-        return self if D == self.D else Crowd(D // 2, self.radius)
-
     def apart(self, x: Tensor) -> Tensor:
-        return Discs.apart(self, x) if x.shape[2] == self.D else self.of_numbers(x.shape[2]).apart(x)
+        return Discs.apart(self, x) if x.shape[2] == self.D else Crowd(x.shape[2] // 2, self.radius).apart(x)
