@@ -12,7 +12,7 @@ from tests.bench import suite, table
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path("runs/reference")
 PAGES = [Path("README.md"), REFERENCE / "FINDINGS.md", REFERENCE / "BENCH.md"]
-LENGTH, WIDTH = 220, 120
+LENGTH, WIDTH = 200, 120
 """Lines of the README, and characters of a line outside tables."""
 TITLED = re.compile(r"^\*\*.+\*\*\n\n(?:\|.*\n)+", re.MULTILINE)
 """A table in Markdown under its title."""

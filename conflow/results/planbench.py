@@ -167,19 +167,23 @@ def _attempts(records: Sequence[Record]) -> list[Attempt]:
 
 
 def _overview(records: Sequence[Record]) -> Sheet:
-    """Every record in a line: who solved how many scenes, and how soon on average."""
-    methods = dict.fromkeys(_kind(row.method) for record in records for row in record.rows)
-    methods = dict.fromkeys(sorted(methods, key=lambda method: method.startswith("ORCA")))
+    """Every record in a column: who solved how many scenes, and how soon on average."""
+    by_kind = [{_kind(row.method): row for row in record.rows} for record in records]
+    kinds = dict.fromkeys(kind for own in by_kind for kind in own)
     rows = []
-    for record in records:
-        own = {_kind(row.method): f"{_solved(row)}\n{mean(row.seconds):.3f} s" for row in record.rows}
-        others = "\n".join(
+    for kind in sorted(kinds, key=lambda kind: kind.startswith("ORCA")):
+        own = [of_record.get(kind) for of_record in by_kind]
+        rows.append([kind, *(f"{_solved(row)}\n{mean(row.seconds):.3f} s" if row else "" for row in own)])
+    others = [
+        "\n".join(
             f"{other.system.partition(' (')[0]} {other.solved}/{other.scenes}, {other.seconds:g} s"
             for other in peers.PUBLISHED.get((record.task, record.robots), [])
         )
-        rows.append([f"{record.task}, {record.robots}", *(own.get(method, "") for method in methods), others])
+        for record in records
+    ]
     title = f"Scenes of many robots: solved, and mean time over all attempts, on {records[0].hardware}"
-    return title, ["task, robots", *methods, "published, on one large GPU"], rows
+    header = ["", *(f"{record.task}, {record.robots}" for record in records)]
+    return title, header, [*rows, ["published, on one large GPU", *others]]
 
 
 def _kind(method: str) -> str:
