@@ -75,7 +75,7 @@ class Method:
     raw: Propose | None = None
 
 
-def of_model(name: str, model: ConFlow, task: CrowdTask, settings: Settings) -> Method:
+def of_model(name: str, model: ConFlow, task: CrowdTask, config: Config, settings: Settings) -> Method:
     """Candidates of a trained model: its flow, from its own source, with guidance where `settings` asks for it."""
     sized = model.of_numbers(task.robots.D)
 
@@ -88,7 +88,7 @@ def of_model(name: str, model: ConFlow, task: CrowdTask, settings: Settings) -> 
         return propose
 
     guided, raw = sampled(next(iter(task.settings()))), sampled(NONE)
-    return Method(name, descending_from(guided if settings.guided else raw, model.config, settings), guided, raw)
+    return Method(name, descending_from(guided if settings.guided else raw, config, settings), guided, raw)
 
 
 def without_model(config: Config, settings: Settings) -> Method:
@@ -196,7 +196,7 @@ def run(
     """Solve scenes with every method in turn, so that a busy minute of the machine is all methods' minute.
 
     Args:
-        config: of the task, source and margin that descent without a model has; those of the first run.
+        config: of the task, and of the source and margin of descent, the same for all methods.
         models: by name.
         robots: how many.
         scenes: how many, the first of the seed's.
@@ -213,7 +213,7 @@ def run(
     except ValueError as error:
         raise ConfigError(f"task {config.task}: {error}") from None
     methods = [without_model(config, settings)]
-    methods += [of_model(name, model, task, settings) for name, model in models.items()]
+    methods += [of_model(name, model, task, config, settings) for name, model in models.items()]
     with suppress(ModuleNotFoundError):  # named as missing where the table is printed
         methods.append(orca(settings))
     rows, plans = [Row(method.name) for method in methods], [list[Tensor]() for _ in methods]
@@ -342,8 +342,7 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
         sample = model.config.sample
         models[f"{model.config.ablation}-s{model.config.seed}, {sample.steps} steps{', guided' * guided}"] = model
     with ProgressDisplay(console) as display:
-        config = next((model.config for model in models.values()), named)
-        record = run(config, models, robots, scenes, seed, settings, display)
+        record = run(named, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)
     path = results.write(record, Path(options["out"]))
     picture = path.with_suffix(".png")

@@ -128,19 +128,15 @@ def test_demonstrations_are_of_single_robots_and_collide(task: str) -> None:
 
 
 @pytest.mark.parametrize("task", ["random", "highways", "conveyor", "shelf", "room"])
-def test_demonstrations_stay_inside_and_clear_of_most_of_a_map(task: str) -> None:
-    """Each robot takes the clearest of its curves; the shares were seen for 9 robots, and lie 0.05 below that."""
+def test_demonstrations_stay_inside_and_clear_of_a_map(task: str) -> None:
     made = CROWDS[task](9)
     x = made.demonstrations(60, seed=2)
     check(x, task)
-    alone = type(made)(2)  # of one robot there is no crowd, so two of them twice
-    single = x.unflatten(2, (-1, 2)).transpose(1, 2).flatten(0, 1).repeat(1, 1, 2)
     if made.boxes():
-        share = 1 - alone.constraints()["object"].violation(single).float().mean()
-        assert share > {"highways": 0.9, "conveyor": 0.75, "shelf": 0.5, "room": 0.5}[task]
-    between = made.scene(9, 2, 0).view(2, 9, 2)
-    if made.boxes():
-        assert (MapAvoidance(Crowd(1, 0.1), made.boxes()).clearance(between.reshape(18, 1, 2)) >= 0).all()
+        single = x.unflatten(2, (-1, 2)).transpose(1, 2).flatten(0, 1)
+        assert float(MapAvoidance(Crowd(1, 0.05), made.boxes()).swept_clearance(single).min()) >= 0
+        ends = made.scene(9, 2, 0).view(18, 1, 2)
+        assert (MapAvoidance(Crowd(1, 0.1), made.boxes()).clearance(ends) >= 0).all()
 
 
 @pytest.mark.parametrize(("task", "discs"), [("basic", 10), ("dense", 20)])

@@ -78,11 +78,11 @@ class CrowdTask(Task):
         return singles(ends, self.T, generator)
 
 
-def singles(ends: Tensor, T: int, generator: torch.Generator, spread: Tensor | None = None) -> Tensor:
+def singles(ends: Tensor, T: int, generator: torch.Generator) -> Tensor:
     """A trajectory of each robot's own for starts and goals (num, 2, D), (num, T, D).
 
-    x(s) = p + s (q - p) + |q - p| sum_k sin(k pi s) (c a_k n + b_k u) with u along q - p and n to its left; a_k is
-    uniform in +-AMPLITUDES[k - 1], and b_k in ALONG times that; c is 1, or each robot's `spread`, (num, robots).
+    x(s) = p + s (q - p) + |q - p| sum_k sin(k pi s) (a_k n + b_k u) with u along q - p and n to its left; a_k is
+    uniform in +-AMPLITUDES[k - 1], and b_k in ALONG times that.
     """
     p, q = ends.unflatten(2, (-1, 2)).unbind(dim=1)
     travel = q - p
@@ -92,8 +92,6 @@ def singles(ends: Tensor, T: int, generator: torch.Generator, spread: Tensor | N
     waves = torch.from_numpy(np.sin((torch.pi * k[:, None] * s).numpy())).float() * torch.tensor(AMPLITUDES)[:, None]
     waves[:, -1] = 0  # sin(k pi) in floating point is not
     a, b = 2 * torch.rand(2, *p.shape[:2], len(AMPLITUDES), generator=generator) - 1
-    if spread is not None:
-        across = spread[..., None] * across
     line = torch.lerp(p[:, None], q[:, None], s.float()[:, None, None])
     deviation = torch.einsum("bnk,kt,bnc->btnc", a, waves, across) + torch.einsum(
         "bnk,kt,bnc->btnc", ALONG * b, waves, travel

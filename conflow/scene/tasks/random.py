@@ -5,15 +5,15 @@ import torch
 from torch import Tensor
 
 from conflow.scene.crowd import MapAvoidance
-from conflow.scene.measures import leaves_workspace
 from conflow.scene.robots import Crowd
-from conflow.scene.tasks.crowd import AMPLITUDES, CrowdTask, singles
+from conflow.scene.routes import routes
+from conflow.scene.tasks.crowd import CrowdTask, singles
 
 BORDER = 0.95
 """Starts and goals are within +- this."""
 TRIES = 10_000
-CANDIDATES, WIDEST, SCENES = 32, 0.8, 32
-"""Curves that a robot tries, how far the widest swerve in a map, and scenes of which they are held at a time."""
+SCENES = 32
+"""Scenes whose robots find their ways at a time."""
 
 
 class Random(CrowdTask):
@@ -44,25 +44,13 @@ class Random(CrowdTask):
         raise ValueError(f"robots={count}: expected fewer, so many find no room {self.apart} apart")
 
     def singles(self, ends: Tensor, generator: torch.Generator) -> Tensor:
-        """As in an empty square, of CANDIDATES curves that each robot tries the clearest, none of which leaves it.
+        """Nearly straight, along the walls where that would leave the square; in a map on a way through it."""
+        if not self.boxes():
+            return singles(ends, self.T, generator).clamp(-1, 1)
+        # Few scenes at a time: of a thousand all grids would take gigabytes.
+        return torch.cat([self._routes(piece, generator) for piece in ends.split(SCENES)])
 
-        The first is nearly straight; in a map others go a long way round.
-        """
-        # Few scenes at a time: of a thousand all curves would take gigabytes.
-        return torch.cat([self._clearest(piece, generator) for piece in ends.split(SCENES)])
-
-    def _clearest(self, ends: Tensor, generator: torch.Generator) -> Tensor:
-        num, count = len(ends), ends.shape[2] // 2
-        tried = ends.repeat_interleave(CANDIDATES, dim=0)
-        spread = torch.ones(len(tried), count)
-        if self.boxes():
-            length = torch.linalg.vector_norm((tried[:, 1] - tried[:, 0]).unflatten(1, (-1, 2)), dim=2)
-            spread = torch.rand(spread.shape, generator=generator) * WIDEST / (AMPLITUDES[0] * length)
-        spread[::CANDIDATES] = 0
-        x = singles(tried, self.T, generator, spread).view(num, CANDIDATES, self.T, count, 2)
-        each, alone = x.transpose(2, 3).reshape(-1, self.T, 2), Crowd(1, self.robots.radius)
-        clearance = MapAvoidance(alone, self.boxes()).clearance(each).amin(dim=1) if self.boxes() else each[:, 0, 0] * 0
-        clearance = torch.where(leaves_workspace(each), -torch.inf, clearance.clamp(max=0))
-        # Of the clear ones any: the clearest would all keep far away.
-        best = clearance.view(num, CANDIDATES, count).flip(1).argmax(dim=1)
-        return x.flip(1).take_along_dim(best[:, None, None, :, None], dim=1)[:, 0].flatten(2)
+    def _routes(self, ends: Tensor, generator: torch.Generator) -> Tensor:
+        p, q = ends.unflatten(2, (-1, 2)).transpose(0, 1).flatten(1, 2)
+        x = routes(p, q, self.boxes(), self.robots.radius, self.T, generator)
+        return x.unflatten(0, (len(ends), -1)).transpose(1, 2).flatten(2)
