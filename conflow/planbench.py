@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from statistics import mean, median
@@ -29,6 +30,7 @@ from conflow.results.printing import checked_format
 from conflow.scene.crowd import CrowdAvoidance
 from conflow.scene.measures import leaves_workspace, path_length, smoothness
 from conflow.scene.settings import Box
+from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import CrowdTask
 from conflow.tracking import store
 from conflow.tracking.recording import hardware
@@ -75,19 +77,23 @@ class Method:
     raw: Propose | None = None
 
 
-def of_model(name: str, model: ConFlow, task: CrowdTask, config: Config, settings: Settings) -> Method:
-    """Candidates of a trained model: its flow, from its own source, with guidance where `settings` asks for it."""
-    sized = model.of_numbers(task.robots.D)
+def of_model(name: str, model: ConFlow, config: Config, settings: Settings) -> Method:
+    """Candidates of a trained model: its flow, from its own source, with guidance where `settings` asks for it.
 
-    def sampled(setting: str) -> Propose:
-        def propose(_: CrowdTask, ends: Tensor, num: int, seed: int) -> Tensor:
-            y = ends.expand(num, -1, -1)
-            x_0 = sized.source.sample(y, random_stream("planbench", seed))
-            return exact(sized.source, sized.flow(x_0, setting, y), y)
+    A network that was trained without a scene's map, or with another radius, meets them here, as it meets more robots.
+    """
+    on = lru_cache(maxsize=1)(model.on)
+
+    def proposed(guided: bool) -> Propose:
+        def propose(task: CrowdTask, ends: Tensor, num: int, seed: int) -> Tensor:
+            here, y = on(task), ends.expand(num, -1, -1)
+            x_0 = here.source.sample(y, random_stream("planbench", seed))
+            setting = next(iter(task.settings())) if guided else NONE
+            return exact(here.source, here.flow(x_0, setting, y), y)
 
         return propose
 
-    guided, raw = sampled(next(iter(task.settings()))), sampled(NONE)
+    guided, raw = proposed(True), proposed(False)
     return Method(name, descending_from(guided if settings.guided else raw, config, settings), guided, raw)
 
 
@@ -213,7 +219,7 @@ def run(
     except ValueError as error:
         raise ConfigError(f"task {config.task}: {error}") from None
     methods = [without_model(config, settings)]
-    methods += [of_model(name, model, task, config, settings) for name, model in models.items()]
+    methods += [of_model(name, model, config, settings) for name, model in models.items()]
     with suppress(ModuleNotFoundError):  # named as missing where the table is printed
         methods.append(orca(settings))
     rows, plans = [Row(method.name) for method in methods], [list[Tensor]() for _ in methods]
@@ -322,7 +328,7 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
         console: for progress and the table.
 
     Raises:
-        ConfigError: an option that cannot be used, or a run of another task.
+        ConfigError: an option that cannot be used, or a run of two robots.
     """
     form = checked_format(options["format"])
     if commandline.whole(options, "reference", 0, 1):
@@ -337,10 +343,11 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
     models = {}
     for name in [] if options["run"] == "none" else options["run"].split(","):
         model = load_model(store.artifact(store.find_run(name), MODEL_FILE), arguments)
-        if model.config.task != options["task"]:
-            raise ConfigError(f"run={name}: is of task {model.config.task}, expected one of {options['task']}")
-        sample = model.config.sample
-        models[f"{model.config.ablation}-s{model.config.seed}, {sample.steps} steps{', guided' * guided}"] = model
+        taken = model.config
+        if taken.task not in CROWDS:
+            raise ConfigError(f"run={name}: is of task {taken.task}, expected one of many robots")
+        learned = "" if taken.task == options["task"] else f"{taken.task}-"
+        models[f"{learned}{taken.ablation}-s{taken.seed}, {taken.sample.steps} steps{', guided' * guided}"] = model
     with ProgressDisplay(console) as display:
         record = run(named, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)

@@ -179,6 +179,23 @@ def test_what_is_published_stands_apart_with_its_hardware(record: Record) -> Non
     )
 
 
+def test_a_model_meets_maps_and_radii_that_it_was_not_trained_on(model: ConFlow) -> None:
+    settings = Settings(num=2, limit=20.0, looked=1)
+    for task in ("basic", "scaled_weave"):
+        named = config.load([f"task={task}", "ablation=plus"])
+        made = planbench.crowd(named, 6)
+        scene, ends = made.in_scene(6, 0, 0), made.scene(6, 0, 0)
+        ours = planbench.of_model("ours", model, named, settings)
+        x, _ = ours.solve(scene, ends, 0)
+        assert x is not None
+        assert bool(planbench.feasible(scene, x[None], ends[None]).all())
+        assert ours.propose is not None
+        # On a map of its own another network's features are in play, with the same weights.
+        there = ours.propose(scene, ends, 2, 0)
+        assert torch.equal(there, ours.propose(scene, ends, 2, 0))
+        assert torch.equal(there[:, [0, -1]], ends.expand(2, -1, -1))
+
+
 def test_the_benchmark_is_of_crowds_that_find_room(model: ConFlow) -> None:
     settings = Settings()
     with ProgressDisplay(Console(quiet=True)) as display:

@@ -72,7 +72,11 @@ class ConFlow(nn.Module):
         """The same model for configurations of D numbers, such as of more robots of a crowd: its weights, shared."""
         if D == self.D or not isinstance(self.task.robots, Crowd):
             return self
-        made = ConFlow(self.config, self.task.of_numbers(D))
+        return self.on(self.task.of_numbers(D))
+
+    def on(self, task: Task) -> "ConFlow":
+        """The same model for another task of a crowd, such as in another map: its weights, shared."""
+        made = ConFlow(self.config, task)
         made.v.load_state_dict(self.v.state_dict(), assign=True)
         return made.eval()
 

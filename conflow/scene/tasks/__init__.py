@@ -11,13 +11,14 @@ from conflow.scene.tasks.passing import Passing
 from conflow.scene.tasks.random import Random
 from conflow.scene.tasks.social import Social
 from conflow.scene.tasks.swap import Swap
-from conflow.scene.tasks.weave import Weave
+from conflow.scene.tasks.weave import ScaledWeave, Weave
 
 SWAPS = {"swap": Swap, "passing": Passing, "social": Social}
 """Two robots that swap sides, or more of a file's."""
 CROWDS: Mapping[str, Callable[..., CrowdTask]] = {
     "circle": Circle,
     "weave": Weave,
+    "scaled_weave": ScaledWeave,
     "random": Random,
     "highways": Highways,
     "conveyor": Conveyor,

@@ -41,13 +41,13 @@ class CrowdTask(Task):
             raise ValueError(f"robots={robots}: expected a whole number of at least 2, or a list of them")
         if not isinstance(radius, int | float) or not 0 < radius <= LARGEST:
             raise ValueError(f"radius={radius}: expected a number above 0 and at most {LARGEST}")
-        self.counts, self.robots = counts, Crowd(counts[-1], radius)
+        self.counts, self.radius, self.robots = counts, radius, Crowd(counts[-1], radius)
 
     def variants(self) -> Sequence[Task]:
-        return [type(self)(count, self.robots.radius) for count in self.counts]
+        return [type(self)(count, self.radius) for count in self.counts]
 
     def of_numbers(self, D: int) -> Task:
-        made = type(self)(D // 2, self.robots.radius)
+        made = type(self)(D // 2, self.radius)
         made.scale, made.offset, made.seconds = self.scale, self.offset, self.seconds
         return made
 

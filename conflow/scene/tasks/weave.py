@@ -1,7 +1,12 @@
 """Robots on the border of a square that all cross to the other side."""
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
+from conflow.scene.robots import Crowd
+from conflow.scene.task import Task
 from conflow.scene.tasks.crowd import CrowdTask
 
 REACH, SIDE = 0.8, 0.87
@@ -29,3 +34,22 @@ class Weave(CrowdTask):
         goal = start.copy()
         np.put_along_axis(goal, crossing, -np.take_along_axis(start, crossing, 1), 1)
         return start, goal
+
+
+class ScaledWeave(Weave):
+    """`Weave` of more robots in a world that grows with them, so that starts keep 0.15 of its units.
+
+    The world is s = max(1, 1.001 0.15 N sqrt(2) / (0.8 2 pi 0.995)) times as large; here it stays [-1, 1]^2, discs are
+    s times smaller, and `scale` is s.
+    """
+
+    numbers = (40, 64)
+
+    def __init__(self, robots: int | Sequence[int] | None = None, radius: float = 0.05) -> None:
+        super().__init__(robots, radius)
+        count = self.robots.count
+        self.scale = max(1.0, 1.001 * 0.15 * count * math.sqrt(2) / (REACH * 2 * math.pi * 0.995))
+        self.robots = Crowd(count, radius / self.scale)
+
+    def of_numbers(self, D: int) -> Task:
+        return type(self)(D // 2, self.radius)
