@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 from statistics import mean, median
 
@@ -22,8 +21,7 @@ from torch import Tensor
 from conflow import commandline
 from conflow.errors import ConfigError
 from conflow.figures.planbench import animation, success
-from conflow.flow.correction import descent
-from conflow.planner import CHECKED, ROUNDS, exact
+from conflow.planner import exact, looks
 from conflow.results import planbench as results
 from conflow.results.planbench import Record, Row, Settings
 from conflow.results.printing import checked_format
@@ -34,7 +32,7 @@ from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import CrowdTask
 from conflow.tracking import store
 from conflow.tracking.recording import hardware
-from conflow.training.build import MOMENTUM, build_source, build_task, descending, random_stream
+from conflow.training.build import build_source, build_task, descending, random_stream
 from conflow.training.config import Config, load
 from conflow.training.metrics import EnergyDistance
 from conflow.training.model import NONE, ConFlow
@@ -114,16 +112,12 @@ def descending_from(propose: Propose, config: Config, settings: Settings) -> Sol
     def solve(task: CrowdTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
         began = time.perf_counter()
         u_c = descending(config, task, source)
-        while True:
-            states = descent(propose(task, scene, settings.num, seed), u_c, MOMENTUM)
-            for x in islice(states, 0, CHECKED * ROUNDS, CHECKED):
-                good = feasible(task, x, scene.expand(len(x), -1, -1))
-                seconds = time.perf_counter() - began
-                if bool(good.any()):
-                    return x[int(good.nonzero()[0])], seconds
-                if seconds > settings.limit:
-                    return None, seconds
-            seed += 1
+        for x in looks(lambda draw: propose(task, scene, settings.num, seed + draw), u_c):
+            good = feasible(task, x, scene.expand(len(x), -1, -1))
+            seconds = time.perf_counter() - began
+            if bool(good.any()) or seconds > settings.limit:
+                break
+        return (x[int(good.nonzero()[0])] if bool(good.any()) else None), seconds
 
     return solve
 

@@ -8,9 +8,9 @@ With a `model.ckpt` in place of a run in the store it needs torch and numpy alon
 
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
-from itertools import islice
+from itertools import accumulate, count, islice
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -63,9 +63,9 @@ class Plans:
     feasible: Tensor
     smoothness: Tensor
 
-    def __getitem__(self, pair: int) -> "Plans":
-        """The plans of one pair."""
-        return Plans(*(getattr(self, field.name)[pair] for field in fields(self)))
+    def __getitem__(self, which: int | slice) -> "Plans":
+        """The plans of one pair; of a single pair the plans of a slice."""
+        return Plans(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 class Planner:
@@ -224,27 +224,22 @@ class Planner:
         Raises:
             PlanError: as `plan`.
         """
-        sized, began, best = self._sized(start), time.monotonic(), None
+        sized, began = self._sized(start), time.monotonic()
         discs = [sized._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
         met = Sum([*sized._kept(), *map(sized._avoidance, discs)])
-        index = (0, -1)
-        u_c = sized._descending(discs, index)
-        while True:
-            plans = sized.plan(start, goal, num, obstacles, seed=seed, descent=0)
-            states = descent(sized.to_workspace(plans.x), u_c, MOMENTUM)
-            for x in islice(states, 0, CHECKED * ROUNDS, CHECKED):
-                found = _ranked(x[None], met)[0]
-                one = Plans(*(getattr(found, field.name)[:1] for field in fields(found)))
-                if best is None or (bool(one.feasible), float(one.clearance)) > (
-                    bool(best.feasible),
-                    float(best.clearance),
-                ):
-                    best = one
-                if progress:
-                    progress(time.monotonic() - began, sized.scale * float(best.clearance))
-                if bool(best.feasible) or time.monotonic() - began > seconds:
-                    return sized._in_users_units(best)
-            seed += 1
+        u_c = sized._descending(discs, (0, -1))
+
+        def propose(draw: int) -> Tensor:
+            return sized.to_workspace(sized.plan(start, goal, num, obstacles, seed=seed + draw, descent=0).x)
+
+        tried = (_nearest(_ranked(x[None], met)[0]) for x in looks(propose, u_c))
+        for best in accumulate(tried, _better):
+            passed = time.monotonic() - began
+            if progress:
+                progress(passed, sized.scale * float(best.clearance))
+            if bool(best.feasible) or passed > seconds:
+                break
+        return sized._in_users_units(best)
 
     def _sized(self, start: Numbers) -> "Planner":
         """The planner for as many robots as a start (..., D) places: this one, unless its robots are a crowd."""
@@ -384,6 +379,23 @@ class Planner:
         x_0 = torch.cat([source.sample(pair.expand(num, -1, -1), random_stream("plan", seed)) for pair in y])
         y = y.repeat_interleave(num, dim=0)
         return exact(source, in_pieces(arrive, x_0, start_and_goal(y)), y).unflatten(0, (-1, num))
+
+
+def looks(propose: Callable[[int], Tensor], u_c: Correction) -> Iterator[Tensor]:
+    """Candidates (num, T, D) on their way down u^c, for ever: those proposed for 0, 1, ..., ROUNDS looks of each."""
+    for draw in count():
+        yield from islice(descent(propose(draw), u_c, MOMENTUM), 0, CHECKED * ROUNDS, CHECKED)
+
+
+def _nearest(plans: Plans) -> Plans:
+    """The one of a pair's plans that is best, or, where none is feasible, nearest to it."""
+    best = 0 if bool(plans.feasible[0]) else int(plans.clearance.argmax())
+    return plans[best : best + 1]
+
+
+def _better(one: Plans, other: Plans) -> Plans:
+    """Of two single plans the feasible one, or the one nearer to it; the first of equals."""
+    return max(one, other, key=lambda plan: (bool(plan.feasible), float(plan.clearance)))
 
 
 def exact(source: Source, x: Tensor, y: Tensor) -> Tensor:

@@ -90,10 +90,13 @@ def test_the_best_of_candidates_is_there_as_soon_as_one_is_feasible(model: ConFl
 
 
 def test_without_a_feasible_one_the_nearest_to_it_comes_when_time_is_up(model: ConFlow) -> None:
-    start, goal = CROWDS["weave"](8).scene(8, 0, 2)
-    best = Planner(model).best_of(start, goal, num=2, seconds=0)
-    assert best.x.shape == (1, 64, 16)
-    assert bool(best.feasible[0]) == (float(best.clearance[0]) >= 0)
+    start, goal = CROWDS["weave"](28).scene(28, 0, 2)
+    best = Planner(model).best_of(start, goal, num=4, seconds=0)
+    assert best.x.shape == (1, 64, 56)
+    first = Planner(model).plan(start, goal, num=4, descent=0)
+    assert not first.feasible.any()
+    assert float(best.clearance[0]) == float(first.clearance.max()) > float(first.clearance[0])
+    assert not best.feasible[0]
 
 
 def test_the_audit_sees_what_happens_between_waypoints_and_at_the_ends(weave: CrowdTask) -> None:
