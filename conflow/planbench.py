@@ -32,10 +32,10 @@ from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import CrowdTask
 from conflow.tracking import store
 from conflow.tracking.recording import hardware
-from conflow.training.build import build_source, build_task, descending, random_stream
+from conflow.training.build import NONE, build_source, build_task, descending, random_stream
 from conflow.training.config import Config, load
 from conflow.training.metrics import EnergyDistance
-from conflow.training.model import NONE, ConFlow
+from conflow.training.model import ConFlow
 from conflow.training.model_file import MODEL_FILE, load_model
 from conflow.training.progress import ProgressDisplay
 

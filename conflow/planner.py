@@ -29,10 +29,10 @@ from conflow.scene.measures import leaves_workspace, smoothness
 from conflow.scene.robots import Crowd
 from conflow.scene.settings import Obstacle
 from conflow.scene.task import Task
-from conflow.training.build import MOMENTUM, barrier, descending, random_stream
+from conflow.training.build import MOMENTUM, NONE, barrier, descending, random_stream
 from conflow.training.config import Range
 from conflow.training.memory import check_memory
-from conflow.training.model import NONE, ConFlow, start_and_goal
+from conflow.training.model import ConFlow, start_and_goal
 from conflow.training.model_file import MODEL_FILE, TaskError, load_model
 
 ALL, AROUND_OBSTACLES = "all", "obstacle"

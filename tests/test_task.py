@@ -125,9 +125,13 @@ class Mine(conflow.Task):
         (COMPLETE.replace("    robots = conflow.Discs(1)\n", ""), "robots"),
         (COMPLETE.replace('{"walls": conflow.Workspace(self.robots)}', "{}"), "expected a constraint in constraints()"),
         (COMPLETE + '    def settings(self): return {"a": ("b",)}\n', "setting a guides around b, expected names of"),
-        (
-            COMPLETE + '    def settings(self): return {"none": ("walls",)}\n',
-            "expected no setting named none",
+        *(
+            (COMPLETE + changed, f"{name}: expected another name than none and refined, which are settings of every")
+            for name in ("none", "refined")
+            for changed in (
+                f'    def settings(self): return {{"{name}": ("walls",)}}\n',
+                f'    def constraints(self): return {{"{name}": conflow.Workspace(self.robots)}}\n',
+            )
         ),
         *(
             (COMPLETE.replace('"walls"', name), "expected a name of letters, digits, _ and -, other than torch's own")
@@ -158,7 +162,8 @@ class Mine(conflow.Task):
     ],
     ids=[
         *("none", "two", "fails", "syntax", "abstract", "no robots", "no constraint", "unknown constraint"),
-        *("setting none", "slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
+        *("setting none", "constraint none", "setting refined", "constraint refined"),
+        *("slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
         *("long offset", "short offset", "nested offset", "empty offset", "no offset", "half an offset"),
         "broken constraints",
         *("imported base", "imported task", "argument", "fails when made", "import"),

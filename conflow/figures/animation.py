@@ -9,9 +9,9 @@ from torch import Tensor
 
 from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, seen_from_above, standing, titled
 from conflow.scene.constraint import Avoidance, Constraint, Sum, Workspace
-from conflow.training.build import joined
+from conflow.training.build import NONE, joined
 from conflow.training.evaluation import Evaluation
-from conflow.training.model import NONE, ConFlow
+from conflow.training.model import ConFlow
 
 TEMPLATE = Path(__file__).with_name("animation.html")
 FRAMES = 200

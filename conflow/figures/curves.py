@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from conflow.flow.settings import Solver
+from conflow.training.build import NONE
 from conflow.training.diagnostics import EVALUATIONS, GuidanceTrace, Solved, by_evaluations, collisions_by_weight
 from conflow.training.metrics import quantile_interval, wilson
-from conflow.training.model import NONE, ConFlow
+from conflow.training.model import ConFlow
 
 # Okabe and Ito's palette, in other colours than the robots.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#0072B2", "#D55E00")

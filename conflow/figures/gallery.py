@@ -18,10 +18,10 @@ from conflow.results.records import Record
 from conflow.scene.task import Task
 from conflow.tracking import store
 from conflow.training import diagnostics
-from conflow.training.build import random_stream
+from conflow.training.build import NONE, random_stream
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.evaluation import Evaluation, cycle
-from conflow.training.model import NONE, ConFlow, start_and_goal
+from conflow.training.model import ConFlow, start_and_goal
 from conflow.training.model_file import MODEL_FILE, load_model
 from conflow.training.reload import demonstrations
 

@@ -16,11 +16,11 @@ from conflow.scene.constraint import Constraint, Sum
 from conflow.scene.robots import Robots
 from conflow.scene.settings import Box
 from conflow.scene.task import Task
-from conflow.training.build import joined, labels
+from conflow.training.build import NONE, REFINED, joined, labels
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import Evaluation
-from conflow.training.model import NONE, REFINED, ConFlow
+from conflow.training.model import ConFlow
 
 # Okabe and Ito's palette.
 ROBOTS = ("#0072B2", "#009E73", "#CC79A7", "#56B4E9")

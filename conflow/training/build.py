@@ -29,6 +29,11 @@ from conflow.scene.tasks import SWAPS, TASKS
 from conflow.training import config
 from conflow.training.config import Config
 
+NONE = "none"
+"""The setting without guidance; the others are the task's."""
+REFINED = "refined"
+"""The setting guided around all that training keeps, with `sample.descent` steps of descent after the flow."""
+
 
 def build_task(settings: Config, T: int | None = None, D: int = 4) -> Task:
     """The task of these settings.
@@ -124,6 +129,9 @@ def checked(task: Task, name: str) -> Task:
         if not isinstance(one, str) or not re.fullmatch(r"[\w-]+", one) or hasattr(torch.nn.ModuleDict, one):
             expected = "expected a name of letters, digits, _ and -, other than torch's own"
             raise ConfigError(f"task={name}: {brief(one)}: {expected}")
+        if one in (NONE, REFINED):
+            expected = f"expected another name than {NONE} and {REFINED}, which are settings of every task"
+            raise ConfigError(f"task={name}: {one}: {expected}")
     if twice := sorted(trained & at_inference):
         raise ConfigError(f"task={name}: expected other names at inference, found {', '.join(twice)}")
     for setting, guided in task.settings().items():
@@ -131,8 +139,6 @@ def checked(task: Task, name: str) -> Task:
             if constraint not in known:
                 expected = f"expected names of constraints, {', '.join(sorted(known))}"
                 raise ConfigError(f"task={name}: setting {setting} guides around {constraint}, {expected}")
-    if "none" in task.settings():
-        raise ConfigError(f"task={name}: expected no setting named none, which is that without guidance")
     return task
 
 

@@ -11,8 +11,8 @@ from conflow.flow.sampler import integrate, states
 from conflow.flow.settings import Solver
 from conflow.scene.constraint import Constraint
 from conflow.scene.measures import endpoint_error, smoothness
-from conflow.training.build import joined
-from conflow.training.model import NONE, ConFlow, start_and_goal
+from conflow.training.build import NONE, joined
+from conflow.training.model import ConFlow, start_and_goal
 
 EVALUATIONS: dict[Solver, int] = {"euler": 1, "midpoint": 2, "rk4": 4}
 """Network evaluations of one step."""

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from conflow.flow.sampler import PIECE
 from conflow.scene.measures import endpoint_error
-from conflow.training.build import random_stream
+from conflow.training.build import NONE, random_stream
 from conflow.training.config import SPLITS, SplitName
 from conflow.training.datamodule import Split
 from conflow.training.metrics import EnergyDistance, trajectory_metrics
-from conflow.training.model import NONE, ConFlow, start_and_goal
+from conflow.training.model import ConFlow, start_and_goal
 from conflow.training.progress import ProgressDisplay
 
 LATENCY_BATCH = 256

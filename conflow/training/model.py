@@ -17,6 +17,8 @@ from conflow.scene.robots import Crowd
 from conflow.scene.task import Task
 from conflow.training.build import (
     MOMENTUM,
+    NONE,
+    REFINED,
     barrier,
     build_correction,
     build_network,
@@ -27,11 +29,6 @@ from conflow.training.build import (
     labels,
 )
 from conflow.training.config import Config
-
-NONE = "none"
-"""The setting without guidance; the others are the task's."""
-REFINED = "refined"
-"""The setting guided around all that training keeps, with `sample.descent` steps of descent after the flow."""
 
 
 class ConFlow(nn.Module):
