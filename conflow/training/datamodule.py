@@ -147,9 +147,7 @@ class DemonstrationData(LightningDataModule):
             task = task or build_task(self.config)
             # The whole once more in the splits, and twice while it is generated.
             check_memory("data.num", data.num, 4 * 4 * data.num * task.T * task.robots.D)
-            made = task.demonstrations(data.num, data.seed)
-            origin = f"demonstrations of task {task.name}"
-            found = made if isinstance(made, Demonstrations) else Demonstrations(made)
+            origin, found = f"demonstrations of task {task.name}", self._made(task)
             demonstrations.check(found.x, origin)
         if found.x.shape[1:] != (task.T, task.robots.D):
             raise DemonstrationError(
@@ -157,6 +155,11 @@ class DemonstrationData(LightningDataModule):
                 f"and the numbers of task {task.name}"
             )
         return origin, found, task
+
+    def _made(self, task: Task) -> Demonstrations:
+        """What a task's own generator makes."""
+        made = task.demonstrations(self.config.data.num, self.config.data.seed)
+        return made if isinstance(made, Demonstrations) else Demonstrations(made)
 
     def _task_of(self, x: Tensor, origin: str) -> Task:
         """The task that the config names, for trajectories x (N, T, D) of a file."""
@@ -203,9 +206,7 @@ class DemonstrationData(LightningDataModule):
         """What training sees of the task's other variants."""
         data, found = self.config.data, []
         for task in self.task.variants()[:-1]:
-            made = task.demonstrations(data.num, data.seed)
-            x = made.x if isinstance(made, Demonstrations) else made
-            split = Split(x, labels(self.config, task).violation(x))
+            split = self._labelled(self._made(task).x, task)
             split = self._repaired(split, task) if data.repair else split
             split = split if data.negatives else split.feasible()
             if len(split.x):
@@ -213,7 +214,9 @@ class DemonstrationData(LightningDataModule):
         return found
 
     def _repaired(self, split: Split, task: Task) -> Split:
-        x = repaired(self.config, task, split.x)
+        return self._labelled(repaired(self.config, task, split.x), task)
+
+    def _labelled(self, x: Tensor, task: Task) -> Split:
         return Split(x, labels(self.config, task).violation(x))
 
     def train_dataloader(self) -> Batches:
