@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from conflow.errors import ConfigError
 from conflow.training import config
 
 if TYPE_CHECKING:
@@ -14,10 +15,10 @@ def train(task: "Task | str" = config.PAPERS_TASK, ablation: str = "cgp", **sett
     """Train, sample, evaluate and track one experiment, as `make train` does; the id of its MLflow run.
 
     Args:
-        task: a task of one's own, or the name of one, or the file of one.
+        task: a task of one's own, or the name of any, or the file of one.
         ablation: the method.
         settings: `preset`, `seed`, and any other; those with a dot in their name with two underscores in its place, as
-            in `train__max_steps=100`.
+            in `train__max_steps=100`, or `task__robots=20` of what the task is made with.
 
     Raises:
         ConfigError: a setting that cannot be used.
@@ -64,11 +65,21 @@ def compare(
 
 
 def _task(task: "Task | str") -> list[str]:
-    """The argument that names a task. One of a file is known by it, so that runs from there and from here are equal."""
+    """The argument that names a task. One of a file is known by it, so that runs from there and from here are equal.
+
+    Raises:
+        ConfigError: an object of a named task, whose settings it does not tell.
+    """
     if isinstance(task, str):
         return [f"task={task}"]
-    from conflow.training.build import file_of
+    from conflow.scene.tasks import TASKS
+    from conflow.training.build import file_of, settings_of
 
+    for name, kind in TASKS.items():
+        if type(task) is kind:
+            own = [f"task__{one}=..." for one in settings_of(kind)] if name not in config.SWAPS else []
+            expected = f'expected its name, task="{name}"' + f", and {', '.join(own)}" * bool(own)
+            raise ConfigError(f"task={type(task).__name__}(...): {expected}")
     return [f"task={file_of(task)}"]
 
 

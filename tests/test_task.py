@@ -1,7 +1,7 @@
 """What a task brings, what follows from it by itself, and the file that one is read from."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import conflow
 from conflow.errors import ConfigError
 from conflow.scene.constraint import Constraint, ObstacleAvoidance, RobotAvoidance, Workspace
 from conflow.scene.robots import Discs, Robots
@@ -195,6 +196,18 @@ def test_a_file_that_is_called_as_a_named_task_is_refused(tmp_path: Path) -> Non
     (tmp_path / "swap.py").write_text(COMPLETE)
     with pytest.raises(ConfigError, match=r"expected another name than that of the task swap, .*rename the file$"):
         task_of_file(tmp_path / "swap.py")
+
+
+@pytest.mark.parametrize("call", [conflow.train, conflow.compare])
+def test_an_object_of_a_named_task_is_refused_with_what_to_type(call: Callable[..., Any]) -> None:
+    """Before anything is written: a run knows its task by name and settings."""
+    with pytest.raises(ConfigError) as refused:
+        call(task=TASKS["weave"](10))
+    assert (
+        str(refused.value) == 'task=Weave(...): expected its name, task="weave", and task__robots=..., task__radius=...'
+    )
+    with pytest.raises(ConfigError, match=r'^task=Swap\(\.\.\.\): expected its name, task="swap"$'):
+        call(task=build_task(config.load()))
 
 
 FUTURE = """

@@ -64,12 +64,12 @@ def build_task(settings: Config, T: int | None = None, D: int = 4) -> Task:
 
 
 def made(kind: Callable[..., Task], name: str, of_task: Mapping[str, Any]) -> Task:
-    """A task of a class, made with settings of its own: the arguments that its constructor names.
+    """A task of a class, made with settings of its own.
 
     Raises:
         ConfigError: it takes no such argument, or refuses a value.
     """
-    takes = [one for one in inspect.signature(kind).parameters if one not in ("args", "kwargs")]
+    takes = settings_of(kind)
     for one, value in of_task.items():
         if one not in takes:
             expected = f"expected one of {', '.join(takes)}{nearest(one, takes)}" if takes else "it takes none"
@@ -78,6 +78,11 @@ def made(kind: Callable[..., Task], name: str, of_task: Mapping[str, Any]) -> Ta
         return kind(**of_task)
     except ValueError as error:
         raise ConfigError(f"task {name}: {error}") from None
+
+
+def settings_of(kind: Callable[..., Task]) -> list[str]:
+    """The settings of its own that a task is made with, `task.NAME`: the arguments that its constructor names."""
+    return [one for one in inspect.signature(kind).parameters if one not in ("args", "kwargs")]
 
 
 def task_of_file(path: Path, of_task: Mapping[str, Any] = MappingProxyType({})) -> Task:
