@@ -83,12 +83,17 @@ def test_wilsons_ends_are_where_the_score_test_turns(count: int, total: int) -> 
 
 @pytest.mark.parametrize("total", [20, 256, 500, 2048, 10_240])
 @pytest.mark.parametrize("q", [0.5, 0.95])
-def test_the_ranks_of_a_quantiles_interval_are_scipys_to_one(q: float, total: int) -> None:
+def test_the_ranks_of_a_quantiles_interval_are_scipys(q: float, total: int) -> None:
     """Of 0, 1, ..., which are their own ranks; SciPy has none above the 0.95-quantile of 20."""
     exact = stats.quantile_test(np.arange(total), q=total * q, p=q).confidence_interval(0.95)
     low, high = quantile_interval(torch.randperm(total, generator=torch.Generator().manual_seed(0)).double(), q)
-    assert abs(low - exact.low) <= 1
-    assert high == total - 1 if math.isnan(exact.high) else abs(high - exact.high) <= 1
+    assert (low, high) == (exact.low, total - 1 if math.isnan(exact.high) else exact.high)
+
+
+@pytest.mark.parametrize("total", [21, 500])
+def test_the_interval_of_a_median_is_the_same_from_above(total: int) -> None:
+    low, high = quantile_interval(torch.arange(total).double(), 0.5)
+    assert low + high == total - 1
 
 
 @pytest.mark.parametrize(("seeds", "total"), [(2, 2048), (3, 2048), (5, 10240)])

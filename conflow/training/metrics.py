@@ -46,18 +46,19 @@ def wilson(count: int, total: int) -> tuple[float, float]:
 
 
 def quantile_interval(values: Tensor, q: float) -> tuple[float, float]:
-    """Distribution-free 95 % interval of the q-quantile: order statistics at n q -+ z sqrt(n q (1 - q)).
+    """Distribution-free 95 % interval of the q-quantile: two order statistics.
 
-    Published runs have these. SciPy's `quantile_test` takes exact binomial ranks, at most one rank away, and has no
-    upper end where the sample is too small for one; here it is then the largest value.
+    So many values lie below the quantile as heads fall, B ~ Binomial(n, q). The lower end is the highest order
+    statistic that is above it with probability at most 2.5 %, and the upper end the lowest that is below it so
+    seldom: SciPy's `quantile_test`. Where the sample is too small for an end it is the smallest or the largest value.
 
     Args:
         values: a sample (n,), in any order.
         q: in (0, 1).
     """
     n = len(values)
-    spread = Z * math.sqrt(n * q * (1 - q))
-    ranks = torch.tensor([math.floor(n * q - spread), math.ceil(n * q + spread)]).clamp(0, n - 1)
+    below, above = stats.binom.ppf([0.025, 0.975], n, q)
+    ranks = torch.tensor([int(below) - 1, int(above)]).clamp(0, n - 1)  # from 0 on
     low, high = values.sort().values[ranks].tolist()
     return low, high
 
