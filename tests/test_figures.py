@@ -99,7 +99,7 @@ def test_a_collision_is_marked_between_the_robots_that_collide() -> None:
     x[0, 3] = torch.tensor([-0.9, 0.9, 0.5, 0.2, 0.5, 0.4])
     figure = workspace._workspaces(1, 1)[0]
     workspace._judged(figure.axes[0], x, flow.judged["robot"], "two")
-    assert figure.axes[0].get_title() == "two\n1 of 2 (50.0%) collide"
+    assert figure.axes[0].get_title() == "two\n1 of 2 (50.0%) in violation"
     torch.testing.assert_close(marks(figure.axes[0]), torch.tensor([[0.5, 0.3]]))
 
 
@@ -258,6 +258,14 @@ def test_several_constraints_mark_a_collision_amid_the_bodies_that_come_so_close
     found = workspace._contacts(x, trained)
     torch.testing.assert_close(found[:2], torch.tensor([[0.5, 0.25], [0.3, 0.0]]))
     assert found[2].abs().tolist() == pytest.approx([0.9, 0.9]), "where the fast one was, or where it is then"
+
+
+def test_what_is_too_fast_is_no_collision() -> None:
+    """Titles and legends speak of violations, whatever is violated."""
+    flow, data, evaluation = sampled(Hall())
+    for figure in (workspace.page(flow, data, evaluation, "test"), workspace.clearances(flow, evaluation)):
+        assert any(" in violation" in axis.get_title() for axis in figure.axes)
+        assert not [text for text in figure.findobj(Text) if re.search("colli[ds]", text.get_text())]
 
 
 def test_obstacles_are_drawn_where_they_are_there() -> None:
@@ -440,10 +448,10 @@ def test_the_animation_needs_nothing_from_outside_and_holds_every_frame(evaluati
     content = json.loads(page.split("const content = ")[1].split(";\n")[0])
     assert content["name"] == "a </script> name"
     collides = distance(evaluation.samples["none"]).amin(dim=1) < 0.3
-    assert [": collides" in scene["label"] for scene in content["scenes"]] == [True, True, False, False]
+    assert [": in violation" in scene["label"] for scene in content["scenes"]] == [True, True, False, False]
     for scene in content["scenes"]:
         i = int(scene["label"].split(":")[0])
-        assert bool(collides[i]) == (": collides" in scene["label"])
+        assert bool(collides[i]) == (": in violation" in scene["label"])
         for panel, setting in zip(scene["panels"], SETTINGS, strict=True):
             x = evaluation.samples[setting][i]
             positions, gap = torch.tensor(panel["positions"]), torch.tensor(panel["keptGap"])
@@ -451,7 +459,7 @@ def test_the_animation_needs_nothing_from_outside_and_holds_every_frame(evaluati
             assert len(positions) == len(gap) == 31 * fill + 1 > 150
             torch.testing.assert_close(positions[::fill].flatten(1), x, rtol=0, atol=6e-5)  # four digits
             torch.testing.assert_close(gap, distance(positions.flatten(1)) - 0.3, rtol=0, atol=3e-4)
-            if ": collides" in scene["label"] and setting == "none":
+            if ": in violation" in scene["label"] and setting == "none":
                 assert float(gap.min()) < 0
 
 
@@ -469,7 +477,7 @@ def test_colliding_trajectories_are_missing_where_there_are_none(evaluation: Eva
         evaluation.source_samples[feasible], {setting: x[feasible] for setting, x in evaluation.samples.items()}
     )
     scenes = json.loads(animation(flow, apart, "").split("const content = ")[1].split(";\n")[0])["scenes"]
-    assert [": collides" in scene["label"] for scene in scenes] == [False, False]
+    assert [": in violation" in scene["label"] for scene in scenes] == [False, False]
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ EACH = 2
 def animation(model: ConFlow, evaluation: Evaluation, name: str) -> str:
     """The robots of a few trajectories under every setting, side by side.
 
-    Up to two trajectories that collide without guidance and two that do not; all settings start from the same x_0.
+    Up to two trajectories in violation without guidance and two that are not; all settings start from the same x_0.
     """
     violates = model.trained.violation(evaluation.samples[NONE])
     chosen = [*violates.nonzero().flatten()[:EACH].tolist(), *(~violates).nonzero().flatten()[:EACH].tolist()]
@@ -32,7 +32,7 @@ def animation(model: ConFlow, evaluation: Evaluation, name: str) -> str:
         "colours": {"robots": ROBOTS, "collision": COLLISION, "obstacle": OBSTACLE},
         "scenes": [
             {
-                "label": f"{i}: {'collides' if violates[i] else 'no collision'} without guidance",
+                "label": f"{i}: {'in violation' if violates[i] else 'feasible'} without guidance",
                 "panels": [
                     _panel(model, evaluation.samples[setting][i : i + 1], setting) for setting in model.settings
                 ],

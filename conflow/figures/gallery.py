@@ -48,7 +48,7 @@ def draw(wanted: Sequence[str], split: SplitName, console: Console, task: Task |
         console.print("all runs: methods.png, taken_back.png", highlight=False)
         methods = workspace.methods([(title, model, evaluation) for title, model, evaluation, _ in made])
         taken_back = curves.taken_back(
-            [(_collisions(title, model, evaluation), shares) for title, model, evaluation, shares in made]
+            [(_violations(title, model, evaluation), shares) for title, model, evaluation, shares in made]
         )
         taken_back.axes[0].set_title(f"what the velocity takes back by t = 1, at t = {COMPARED}")
         workspace.save({"methods": methods, "taken_back": taken_back}, _folder() / _subfolder(split))
@@ -75,10 +75,10 @@ def _title(run: Run) -> str:
     return " ".join([f"{one.preset}/{run.info.run_name}", *changes])
 
 
-def _collisions(title: str, model: ConFlow, evaluation: Evaluation) -> str:
-    """The title, and how many of the trajectories without guidance collide."""
-    collide = model.trained.violation(evaluation.samples[NONE])
-    return f"{title}: {int(collide.sum())} of {len(collide)} collide"
+def _violations(title: str, model: ConFlow, evaluation: Evaluation) -> str:
+    """The title, and how many of the trajectories without guidance violate what training keeps."""
+    violates = model.trained.violation(evaluation.samples[NONE])
+    return f"{title}: {int(violates.sum())} of {len(violates)} in violation"
 
 
 def _folder() -> Path:

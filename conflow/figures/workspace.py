@@ -44,10 +44,10 @@ def titled(setting: str) -> str:
 
 
 def demonstrations(data: DemonstrationData) -> Figure:
-    """The paper's first figure: demonstrations without and with a collision."""
+    """The paper's first figure: demonstrations that keep the constraint, and those that violate it."""
     figure, axes = _workspaces(1, 2)
     kept = labels(data.config, data.task)
-    for axis, violates, name in zip(axes, (False, True), ("feasible, $D^+$", "in collision, $D^-$"), strict=True):
+    for axis, violates, name in zip(axes, (False, True), ("feasible, $D^+$", "in violation, $D^-$"), strict=True):
         chosen = data.violates == violates
         _trajectories(axis, data.x[chosen], data.violates[chosen], kept)
         axis.set_title(f"{name}: {int(chosen.sum())} of {len(data.x)}")
@@ -120,11 +120,11 @@ def clearances(model: ConFlow, evaluation: Evaluation) -> Figure:
     for axis, setting in zip(figure.subplots(1, len(settings), sharey=True), settings, strict=True):
         x = evaluation.samples[setting]
         _clearances(axis, x, model)
-        axis.set_title(f"{titled(setting)}\n{_share(model.trained.violation(x))} collide")
+        axis.set_title(f"{titled(setting)}\n{_share(model.trained.violation(x))} in violation")
         axis.label_outer()
     handles = [
-        Line2D([], [], color="#666666", label="without collision"),
-        Line2D([], [], color=COLLISION, label=f"in collision (first {SHOWN} drawn)"),
+        Line2D([], [], color="#666666", label="feasible"),
+        Line2D([], [], color=COLLISION, label=f"in violation (first {SHOWN} drawn)"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     return figure
@@ -185,11 +185,11 @@ def _settings(axes: Sequence[Axes], model: ConFlow, evaluation: Evaluation) -> N
         )
 
 
-def _judged(axis: Axes, x: Tensor, constraint: Constraint, name: str, verb: str = "collide") -> None:
+def _judged(axis: Axes, x: Tensor, constraint: Constraint, name: str, what: str = "in violation") -> None:
     """Trajectories under a title that says how many of all of them violate the constraint."""
     violates = constraint.violation(x)
     _trajectories(axis, x, violates, constraint)
-    axis.set_title(f"{name}\n{_share(violates)} {verb}")
+    axis.set_title(f"{name}\n{_share(violates)} {what}")
 
 
 def _share(violates: Tensor) -> str:
@@ -295,7 +295,7 @@ def _legend(figure: Figure, robots: Robots) -> None:
             color=COLLISION if named else "none",
             marker="x",
             markeredgecolor="black",
-            label=f"in collision, crossed where closest (first {shown(robots)} drawn)",
+            label=f"in violation, crossed where closest (first {shown(robots)} drawn)",
         )
     )
     # The last column has the long entry, beside as many of the robots' as there is room for.
