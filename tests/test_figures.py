@@ -11,6 +11,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.text import Text
@@ -22,8 +23,9 @@ from conflow.figures import curves, gallery, workspace
 from conflow.figures.animation import animation, frames, gaps
 from conflow.flow.sampler import integrate
 from conflow.scene.constraint import Constraint, ObstacleAvoidance, RobotAvoidance, SpeedLimit, Sum
+from conflow.scene.crowd import CrowdAvoidance
 from conflow.scene.measures import smoothness
-from conflow.scene.robots import Discs
+from conflow.scene.robots import Crowd, Discs
 from conflow.scene.settings import Obstacle
 from conflow.scene.task import Task
 from conflow.tracking import recording, store
@@ -258,6 +260,28 @@ def test_several_constraints_mark_a_collision_amid_the_bodies_that_come_so_close
     found = workspace._contacts(x, trained)
     torch.testing.assert_close(found[:2], torch.tensor([[0.5, 0.25], [0.3, 0.0]]))
     assert found[2].abs().tolist() == pytest.approx([0.9, 0.9]), "where the fast one was, or where it is then"
+
+
+def test_of_a_crowd_one_trajectory_is_drawn_when_there_is_least_room_and_all_that_is_violated() -> None:
+    """Of nine robots in rows the first two touch once; in the second trajectory two others do, in the third none."""
+    robots = Crowd(9, 0.05)
+    x = torch.tensor([[0.4 * i - 0.8, 0.4 * j] for i in range(3) for j in range(3)]).flatten().repeat(3, 5, 1)
+    x[0, 3, :4] = torch.tensor([-0.8, 0.2, -0.8, 0.24])
+    x[1, 1, 14:] = torch.tensor([0.5, 0.5, 0.5, 0.52])
+    figure = workspace._workspaces(1, 2)[0]
+    for shown, axis in zip((x, x[2:]), figure.axes, strict=True):
+        workspace._judged(axis, shown, CrowdAvoidance(robots), "nine")
+    first, clear = figure.axes
+    discs = [patch for patch in first.patches if isinstance(patch, Circle)]
+    torch.testing.assert_close(torch.tensor([disc.center for disc in discs]), x[0, 3].unflatten(0, (9, 2)))
+    assert [disc.radius for disc in discs] == pytest.approx([0.05] * 9)
+    touching = [to_hex(disc.get_facecolor()) == workspace.COLLISION.lower() for disc in discs]
+    assert touching == [True, True] + [False] * 7
+    assert torch.equal(sort(lines(first)), sort(x[0].unflatten(1, (9, 2)).transpose(0, 1)))
+    torch.testing.assert_close(marks(first), torch.tensor([[-0.8, 0.22], [0.5, 0.51]]))
+    assert len(marks(clear)) == 0
+    workspace._legend(figure, robots)
+    assert written_outside(figure) == []
 
 
 def test_what_is_too_fast_is_no_collision() -> None:

@@ -7,7 +7,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from conflow.figures.workspace import COLLISION, OBSTACLE, ROBOTS, rounded, seen_from_above, standing
+from conflow.figures.workspace import COLLISION, NAMED, OBSTACLE, ROBOTS, rounded, seen_from_above, standing
 from conflow.planner import Planner, Plans
 from conflow.scene.settings import Box
 
@@ -16,7 +16,9 @@ PER_ROW = 3
 
 
 def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]] = ()) -> Figure:
-    """The plans of one pair, each robot's in its colour, collisions on top in another, and the best plan in bold.
+    """The plans of one pair, each robot's in its colour, infeasible ones in another, and the best plan in bold.
+
+    Of many robots the best plan alone, whose lines are enough to see.
 
     Args:
         planner: whose plans they are.
@@ -30,14 +32,16 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
     axis.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[-1] - reach, middle[-1] + reach))
     axis.set(xlabel="x", ylabel="y")
     axis.spines[["top", "right"]].set_visible(False)
-    axis.set_title(f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible")
+    crowd = task.robots.count > NAMED
+    best = "\nthe best one is drawn" if crowd else ""
+    axis.set_title(f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible{best}")
     paths = planner.scale * seen_from_above(task.robots, planner.to_workspace(plans.x)) + planner.offset[:2]
     for body, robot in enumerate(task.robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]
-        for shown, drawn in ((plans.feasible, colour), (~plans.feasible, COLLISION)):
+        for shown, drawn in () if crowd else ((plans.feasible, colour), (~plans.feasible, COLLISION)):
             axis.add_collection(LineCollection(list(paths[shown, :, body].numpy()), colors=drawn, alpha=0.4, lw=0.9))
-        axis.plot(*paths[0, :, body].T, color=colour if plans.feasible[0] else COLLISION, lw=2.5)
-        axis.plot(*paths[0, 0, body], "o", color=colour, zorder=3, label=f"robot {robot + 1}")
+        axis.plot(*paths[0, :, body].T, color=colour if plans.feasible[0] else COLLISION, lw=1 if crowd else 2.5)
+        axis.plot(*paths[0, 0, body], "o", color=colour, zorder=3, label=f"robot {robot + 1}" * (not crowd))
         # A ring, so that in a swap it does not hide the other robot's start.
         axis.plot(*paths[0, -1, body], "o", color=colour, zorder=3, ms=11, mfc="none", mew=2)
     axis.plot([], [], color=COLLISION, label="not feasible")

@@ -199,14 +199,15 @@ def _share(violates: Tensor) -> str:
 def _trajectories(axis: Axes, x: Tensor, violates: Tensor, constraint: Constraint) -> None:
     """The first trajectories, each robot's in its colour; those in violation on top, marked at the closest approach."""
     robots = constraint.robots
+    if robots.count > NAMED:
+        _crowd(axis, x[:SHOWN], violates[:SHOWN], constraint)
+        return
     x, violates = x[: shown(robots)], violates[: shown(robots)]
     paths = seen_from_above(robots, x)
     for body, robot in enumerate(robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]
         axis.add_collection(LineCollection(list(paths[~violates, :, body].numpy()), colors=colour, alpha=0.4, lw=0.9))
-        # Of a crowd who goes where is more to see than that somebody collides, which the crosses show.
-        wrong = COLLISION if robots.count <= NAMED else colour
-        axis.add_collection(LineCollection(list(paths[violates, :, body].numpy()), colors=wrong, alpha=0.9, lw=0.9))
+        axis.add_collection(LineCollection(list(paths[violates, :, body].numpy()), colors=COLLISION, alpha=0.9, lw=0.9))
         starts = paths[:, 0, body]
         axis.scatter(starts[:, 0], starts[:, 1], s=6, color=colour, zorder=3)
     contacts = _contacts(x, constraint)[violates]
@@ -214,8 +215,32 @@ def _trajectories(axis: Axes, x: Tensor, violates: Tensor, constraint: Constrain
 
 
 def shown(robots: Robots) -> int:
-    """How many trajectories are drawn: fewer of many robots."""
-    return max(1, min(SHOWN, 4 * SHOWN // robots.count**2))
+    """How many trajectories are drawn: fewer of several robots."""
+    return min(SHOWN, 4 * SHOWN // robots.count**2)
+
+
+def _crowd(axis: Axes, x: Tensor, violates: Tensor, constraint: Constraint) -> None:
+    """Of many robots one trajectory, with the bodies where the least clearance is left; and all closest approaches."""
+    if not len(x):
+        return
+    robots, waypoint = constraint.robots, int(constraint.clearance(x[:1])[0].argmin())
+    path = seen_from_above(robots, x[:1])[0]
+    colours = [ROBOTS[robot % len(ROBOTS)] for robot in robots.owner.tolist()]
+    axis.add_collection(LineCollection(list(path.transpose(0, 1).numpy()), colors=colours, alpha=0.45, lw=0.7))
+    for at, radius, colour, wrong in zip(
+        path[waypoint].tolist(), robots.radii.tolist(), colours, _violating(x[:1], constraint, waypoint), strict=True
+    ):
+        axis.add_artist(Circle(at, radius, fc=COLLISION if wrong else colour, ec="white", lw=0.5, alpha=0.9, zorder=3))
+    contacts = _contacts(x, constraint)[violates]
+    axis.scatter(contacts[:, 0], contacts[:, 1], marker="x", s=14, color="black", linewidth=0.8, alpha=0.7, zorder=4)
+
+
+def _violating(x: Tensor, constraint: Constraint, waypoint: int) -> list[bool]:
+    """Which bodies of a trajectory (1, T, D) violate something at a waypoint."""
+    c, pullback = constraint.vjp(x)
+    violated = torch.zeros_like(c)
+    violated[0, waypoint] = (c[0, waypoint] < 0).to(c)
+    return [bool(moved) for moved in constraint.robots.moved(pullback(violated))[0, waypoint]]
 
 
 def seen_from_above(robots: Robots, x: Tensor) -> Tensor:
@@ -286,18 +311,28 @@ def _obstacles(axis: Axes, obstacles: Sequence[tuple[float, float, float]], robo
 
 
 def _legend(figure: Figure, robots: Robots) -> None:
-    named = robots.count if robots.count <= NAMED else 0
-    handles = [Line2D([], [], color=ROBOTS[i % len(ROBOTS)], label=f"robot {i + 1}") for i in range(named)]
-    handles.append(
-        Line2D(
-            [],
-            [],
-            color=COLLISION if named else "none",
-            marker="x",
-            markeredgecolor="black",
-            label=f"in violation, crossed where closest (first {shown(robots)} drawn)",
-        )
-    )
-    # The last column has the long entry, beside as many of the robots' as there is room for.
-    columns = 1 + int((figure.get_figwidth() - 4.1) / 1.2)
+    width = figure.get_figwidth()
+    if robots.count > NAMED:
+        handles, columns = _of_crowd(), int(width / 3.4)
+    else:
+        # The last column has the long entry, beside as many of the robots' as there is room for.
+        handles, columns = _of_few(robots), 1 + int((width - 4.1) / 1.2)
     figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)), frameon=False)
+
+
+def _of_few(robots: Robots) -> list[Line2D]:
+    crossed = f"in violation, crossed where closest (first {shown(robots)} drawn)"
+    return [
+        *(Line2D([], [], color=ROBOTS[i % len(ROBOTS)], label=f"robot {i + 1}") for i in range(robots.count)),
+        Line2D([], [], color=COLLISION, marker="x", markeredgecolor="black", label=crossed),
+    ]
+
+
+def _of_crowd() -> list[Line2D]:
+    return [
+        Line2D(
+            [], [], ls="none", marker="o", ms=7, color=ROBOTS[0], label="first trajectory, when there is least room"
+        ),
+        Line2D([], [], ls="none", marker="o", ms=7, color=COLLISION, label="robots in violation then"),
+        Line2D([], [], ls="none", marker="x", color="black", label=f"where each of the first {SHOWN} violates most"),
+    ]
