@@ -37,12 +37,12 @@ def from_tracks(options: Mapping[str, str]) -> str:
         ConfigError: an option or the file cannot be used.
         DemonstrationError: the file cannot be written.
     """
-    from conflow.training import tracks  # which needs SciPy
+    from conflow.recordings import windows  # which needs SciPy and pandas
 
     opposite = commandline.whole(options, "opposite", 0, 1) == 1
     fps = commandline.number(options, "fps") if options["fps"] else None
     agents, T = commandline.whole(options, "agents", 1, 99), commandline.whole(options, "T", 3, 4096)
-    found = tracks.read(options["from"], agents, commandline.number(options, "seconds"), T, fps, opposite)
+    found = windows.read(options["from"], agents, commandline.number(options, "seconds"), T, fps, opposite)
     out = _named(options, Path(options["from"]).stem)
     if Path(out) == Path(options["from"]):
         raise ConfigError(f"out={out}: expected another file than from")

@@ -10,10 +10,10 @@ import torch
 
 from conflow.demonstrations import from_tracks
 from conflow.errors import ConfigError
+from conflow.recordings.windows import Windows, closest, read
 from conflow.scene.demonstrations import load
 from conflow.training import config
 from conflow.training.build import build_task
-from conflow.training.tracks import Windows, closest, read
 from tests.papers import label
 
 Row = tuple[int, int, float, float]
