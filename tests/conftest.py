@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from conflow import __main__ as command_line
 from conflow.tracking import signals
 from conflow.training import config
 from conflow.training.config import Config
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
+Typed = Callable[..., tuple[int, str, str]]
 
 # A shell begins what it puts into the background deaf to Ctrl-C, and processes inherit that; tests are about those that
 # hear it.
@@ -35,6 +37,25 @@ def conflow(workplace: Path) -> Command:
         environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
         command = [sys.executable, "-m", "conflow", *arguments]
         return subprocess.run(command, cwd=workplace, env=environment, capture_output=True, text=True, timeout=300)
+
+    return run
+
+
+@pytest.fixture
+def in_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Typed:
+    """Run the command line in an empty folder and in the tests' own process: exit code, output and error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(signals, "raise_on_signals", lambda: None)  # the process keeps its handlers
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["conflow", *arguments])
+        code = 0
+        try:
+            command_line.main()
+        except SystemExit as stopped:
+            code = int(stopped.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
 
     return run
 

@@ -3,8 +3,7 @@
 import errno
 import os
 import subprocess
-import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from conflow import __main__ as command_line
 from conflow.flow.source import cgp, fit_rbf
 from conflow.scene.demonstrations import Demonstrations, check, digest, load, save
 from conflow.scene.errors import DemonstrationError
@@ -24,9 +22,9 @@ from conflow.scene.tasks.passing import passing
 from conflow.scene.tasks.social import social
 from conflow.scene.tasks.social_force import Robots, walk
 from conflow.scene.tasks.swap import swap
-from conflow.tracking import signals
 from conflow.training import config
 from conflow.training.datamodule import DemonstrationData
+from tests.conftest import Typed
 from tests.papers import TWO
 
 
@@ -67,18 +65,23 @@ def test_forty_percent_collide_and_the_others_pass_barely_outside(num: int, T: i
     assert float(below.max()) > 0.98
 
 
+def assert_from_side_to_side(x: Tensor) -> None:
+    """All start and end within the jitter of the sides, and some of many near its limits."""
+    sides = torch.tensor(SIDES)
+    for ends, nominal in ((x[:, 0], sides), (x[:, -1], sides.flip(0))):
+        off = (ends.unflatten(1, (2, 2)) - nominal).abs()
+        # float32 rounding of a coordinate below 1; 3000 draws miss 1 % of their range but for a chance of 1e-12
+        assert bool((off <= 0.04 + 1e-7).all())
+        assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
+
+
 def test_they_are_demonstrations_as_good_as_swaps() -> None:
     """Inside the workspace, finite, in float32, with starts and goals at the jittered sides, and about as smooth."""
     x = passing(5000)
     assert x.dtype == torch.float32
     assert x.shape == (5000, 32, 4)
     check(x, "generated")
-    sides = torch.tensor(SIDES)
-    for ends, nominal in ((x[:, 0], sides), (x[:, -1], sides.flip(0))):
-        off = (ends.unflatten(1, (2, 2)) - nominal).abs()
-        # float32 rounding of a coordinate below 1; 5000 draws miss 1 % of their range but for a chance of 1e-22
-        assert bool((off <= 0.04 + 1e-7).all())
-        assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
+    assert_from_side_to_side(x)
     ratio = smoothness(TWO, x).quantile(0.5) / smoothness(TWO, swap(5000)).quantile(0.5)
     assert 1 / 2 < float(ratio) < 2
 
@@ -174,12 +177,7 @@ def test_social_robots_are_demonstrations_that_accelerate_and_brake() -> None:
     assert x.dtype == torch.float32
     assert x.shape == (3000, 32, 4)
     check(x, "generated")
-    sides = torch.tensor(SIDES)
-    for ends, nominal in ((x[:, 0], sides), (x[:, -1], sides.flip(0))):
-        off = (ends.unflatten(1, (2, 2)) - nominal).abs()
-        # float32 rounding of a coordinate below 1
-        assert bool((off <= 0.04 + 1e-7).all())
-        assert bool((off.amax(dim=0) > 0.99 * 0.04).all())
+    assert_from_side_to_side(x)
     feasible = smoothness(TWO, x[nearest(x) > 0.3])
     assert 0.006 < float(feasible.quantile(0.05)) < float(feasible.quantile(0.95)) < 0.02
     assert float(feasible.median()) > 2.5 * float(smoothness(TWO, swap(3000)).median())
@@ -350,26 +348,10 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
     assert not list(tmp_path.iterdir())
 
 
-Run = Callable[..., tuple[int, str, str]]
-
-
 @pytest.fixture
-def demonstrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """`python -m conflow demonstrations ...` in an empty folder: exit code, output and error."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(signals, "raise_on_signals", lambda: None)  # the tests' own process keeps its handlers
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["conflow", "demonstrations", *arguments])
-        code = 0
-        try:
-            command_line.main()
-        except SystemExit as stopped:
-            code = int(stopped.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return run
+def demonstrations(in_process: Typed) -> Typed:
+    """`python -m conflow demonstrations ...` in an empty folder."""
+    return partial(in_process, "demonstrations")
 
 
 @pytest.mark.parametrize(
@@ -383,7 +365,7 @@ def demonstrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyte
     ids=["defaults", "passing", "social", "social elsewhere"],
 )
 def test_the_command_writes_what_it_says(
-    arguments: tuple[str, ...], name: str, written: Tensor, demonstrations: Run
+    arguments: tuple[str, ...], name: str, written: Tensor, demonstrations: Typed
 ) -> None:
     code, out, err = demonstrations(*arguments)
     assert (code, err) == (0, "")
@@ -392,7 +374,7 @@ def test_the_command_writes_what_it_says(
     assert torch.equal(load(name).x, written)
 
 
-def test_the_command_never_overwrites(demonstrations: Run) -> None:
+def test_the_command_never_overwrites(demonstrations: Typed) -> None:
     Path("passing.npz").write_text("precious")
     code, out, err = demonstrations("task=passing", "num=10")
     assert (code, out) == (2, "")
@@ -419,7 +401,7 @@ def test_the_command_never_overwrites(demonstrations: Run) -> None:
         ("passing.npz", "passing.npz: expected key=value"),
     ],
 )
-def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: str, demonstrations: Run) -> None:
+def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: str, demonstrations: Typed) -> None:
     code, out, err = demonstrations("num=10", argument)
     assert (code, out) == (2, "")
     assert err.startswith(f"conflow: {said}")

@@ -3,8 +3,8 @@
 import math
 import pickle
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 from torch import Tensor
 
-from conflow import __main__ as command_line
 from conflow.errors import ConfigError
 from conflow.figures.plans import picture
 from conflow.figures.workspace import NAMED
@@ -28,11 +27,12 @@ from conflow.scene.robots import Discs, Robots
 from conflow.scene.settings import Obstacle
 from conflow.scene.task import Task
 from conflow.scene.tasks.swap import swap
-from conflow.tracking import signals, store
+from conflow.tracking import store
 from conflow.training import config
 from conflow.training.build import fitted, random_stream
 from conflow.training.model import ConFlow
 from conflow.training.model_file import load_model
+from tests.conftest import Typed
 from tests.papers import keep_apart, model_of
 from tests.test_closed_forms import Balls
 
@@ -750,34 +750,18 @@ def test_a_run_is_found_by_whatever_names_it_or_by_a_file(tmp_path: Path, monkey
         Planner.load("empty-s0")
 
 
-Run = Callable[..., tuple[int, str, str]]
-
-
 @pytest.fixture
-def conflow_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """`python -m conflow sample ...` in a folder with a model.ckpt: exit code, output and error."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(signals, "raise_on_signals", lambda: None)  # the tests' own process keeps its handlers
+def conflow_sample(in_process: Typed, tmp_path: Path) -> Typed:
+    """`python -m conflow sample ...` in a folder with a model.ckpt."""
     save(planner(still=True).model, tmp_path / "model.ckpt")
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["conflow", "sample", "run=./model.ckpt", *arguments])
-        code = 0
-        try:
-            command_line.main()
-        except SystemExit as stopped:
-            code = int(stopped.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return run
+    return partial(in_process, "sample", "run=./model.ckpt")
 
 
 PAIR = ("start=-0.8,0,0.8,0", "goal=0.8,0,-0.8,0")
 
 
 def test_the_command_writes_plans_and_picture_and_says_how_many_are_feasible(
-    conflow_sample: Run, tmp_path: Path
+    conflow_sample: Typed, tmp_path: Path
 ) -> None:
     discs = ("obstacle=0,0.5,0.1", "obstacle=0.3,-0.4,0.05")
     code, out, err = conflow_sample(*PAIR, "out=plans.npz", "num=40", *discs, "guidance=robot", "seed=3")
@@ -802,7 +786,7 @@ def test_the_command_writes_plans_and_picture_and_says_how_many_are_feasible(
     )
 
 
-def test_the_command_takes_points_to_pass(conflow_sample: Run, tmp_path: Path) -> None:
+def test_the_command_takes_points_to_pass(conflow_sample: Typed, tmp_path: Path) -> None:
     code, out, err = conflow_sample(*PAIR, "num=9", "via=0.5,0.1,0.6,-0.1,-0.6", "via=0.26,-0.3,0.37,0.41,-0.32")
     assert (code, err) == (0, "")
     assert "of 9 plans are feasible" in out
@@ -813,7 +797,7 @@ def test_the_command_takes_points_to_pass(conflow_sample: Run, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("existing", ["plans.npz", "plans.png"])
-def test_the_command_never_overwrites(existing: str, conflow_sample: Run) -> None:
+def test_the_command_never_overwrites(existing: str, conflow_sample: Typed) -> None:
     Path(existing).write_text("precious")
     code, out, err = conflow_sample(*PAIR)
     assert (code, out) == (2, "")
@@ -844,7 +828,7 @@ def test_the_command_never_overwrites(existing: str, conflow_sample: Run) -> Non
     ],
 )
 def test_a_bad_command_ends_in_one_line_and_writes_nothing(
-    arguments: tuple[str, ...], said: str, conflow_sample: Run
+    arguments: tuple[str, ...], said: str, conflow_sample: Typed
 ) -> None:
     code, out, err = conflow_sample(*arguments)
     assert (code, out) == (2, "")

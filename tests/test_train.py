@@ -3,7 +3,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from conflow.errors import ConfigError
@@ -14,21 +13,10 @@ from conflow.training.metrics import trajectory_metrics
 from conflow.training.model_file import load_model
 from conflow.training.reload import demonstrations
 from tests.conftest import Command
+from tests.faults.processes import runs, store
 from tests.papers import SETTINGS, model_of
 
 SETTINGS_ARGUMENTS = ["preset=smoke", "seed=3"]
-
-
-def store(workplace: Path) -> MlflowClient:
-    return MlflowClient(f"sqlite:///{workplace / 'runs' / 'mlflow.db'}")
-
-
-def runs(workplace: Path) -> list[Run]:
-    """All runs, the newest first."""
-    client = store(workplace)
-    experiment = client.get_experiment_by_name("conflow")
-    assert experiment is not None
-    return list(client.search_runs([experiment.experiment_id], order_by=["attributes.start_time DESC"]))
 
 
 @pytest.fixture(scope="module")

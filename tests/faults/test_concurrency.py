@@ -12,7 +12,8 @@ from typing import IO
 
 from mlflow.entities import Run
 
-from tests.test_train import artifacts, runs, store
+from tests.faults.processes import runs, store
+from tests.test_train import artifacts
 from tests.test_ui import free_port
 
 # The smallest training that leaves everything that a training leaves.
