@@ -170,9 +170,8 @@ class Planner:
             k: self._configurations(f"via[{i}]", position, batch=False)
             for i, (k, position) in enumerate(_via_points(via, self.model.T).items())
         }
-        discs = [self._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
-        met = {name: self.model.judged[name] for name in self.model.task.constraints()}
-        met |= {f"obstacles[{i}]": self._avoidance(disc) for i, disc in enumerate(discs)}
+        discs = self._discs(obstacles)
+        met = self._met(discs)
         self._refuse_violation("start", start, 0, met)
         self._refuse_violation("goal", goal, -1, met)
         for i, (waypoint, point) in enumerate(points.items()):
@@ -225,12 +224,15 @@ class Planner:
             PlanError: as `plan`.
         """
         sized, began = self._sized(start), time.monotonic()
-        discs = [sized._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
-        met = Sum([*sized._kept(), *map(sized._avoidance, discs)])
+        sized._configurations("start", start, batch=False)
+        seed, seconds = _whole("seed", seed, low=0), _number("seconds", seconds)
+        given = _items("obstacles", obstacles)  # which may be there only once
+        discs = sized._discs(given)
+        met = Sum(list(sized._met(discs).values()))
         u_c = sized._descending(discs, (0, -1))
 
         def propose(draw: int) -> Tensor:
-            return sized.to_workspace(sized.plan(start, goal, num, obstacles, seed=seed + draw, descent=0).x)
+            return sized.to_workspace(sized.plan(start, goal, num, given, seed=seed + draw, descent=0).x)
 
         tried = (_nearest(_ranked(x[None], met)[0]) for x in looks(propose, u_c))
         for best in accumulate(tried, _better):
@@ -249,9 +251,10 @@ class Planner:
         known = D in ((), (self.model.D,)) or D[0] < 4 or D[0] % 2
         return self if known else Planner(self.model.of_numbers(D[0]))
 
-    def _kept(self) -> list[Constraint]:
-        """What training keeps, as plans are judged."""
-        return [self.model.judged[name] for name in self.model.task.constraints()]
+    def _met(self, discs: Sequence[Obstacle]) -> dict[str, Constraint]:
+        """What plans are judged by: all that training keeps, and obstacles."""
+        met = {name: self.model.judged[name] for name in self.model.task.constraints()}
+        return met | {f"obstacles[{i}]": self._avoidance(disc) for i, disc in enumerate(discs)}
 
     def _descending(self, discs: Sequence[Obstacle], index: Sequence[int]) -> Correction:
         """The correction that descent follows: of all that training keeps and of obstacles, at rest at waypoints O."""
@@ -293,6 +296,10 @@ class Planner:
         outside = ~((y >= low) & (y <= high)).all(dim=-1)
         _refuse(name, y, outside, f"expected finite numbers in the workspace {where}")
         return y
+
+    def _discs(self, obstacles: Iterable[Obstacle | Sequence[float]]) -> list[Obstacle]:
+        """Obstacles in workspace units."""
+        return [self._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
 
     def _disc(self, name: str, disc: Obstacle | Sequence[float]) -> Obstacle:
         """An obstacle in workspace units."""
@@ -345,8 +352,8 @@ class Planner:
         if guidance == AROUND_OBSTACLES and guidance not in kept and not obstacles:
             raise PlanError("guidance=obstacle: expected obstacles to guide around, found none")
         sample = self.model.config.sample
-        lambda_r = _weight("robot_weight", robot_weight, sample.robot_weight)
-        lambda_o = _weight("obstacle_weight", obstacle_weight, sample.obstacle_weight)
+        lambda_r = sample.robot_weight if robot_weight is None else _number("robot_weight", robot_weight)
+        lambda_o = sample.obstacle_weight if obstacle_weight is None else _number("obstacle_weight", obstacle_weight)
         weighted = []
         if guidance in (ALL, *kept):
             weighted.append((self.model.u_c, lambda_r))
@@ -528,9 +535,7 @@ def _whole(name: str, value: Any, low: int) -> int:
     return int(value)
 
 
-def _weight(name: str, value: Any, default: float) -> float:
-    if value is None:
-        return default
+def _number(name: str, value: Any) -> float:
     allowed = Range(0, 1e9)
     if not _is_real(value) or value not in allowed:
         raise PlanError(f"{name}={brief(value)}: expected a finite number {allowed}")

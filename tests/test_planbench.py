@@ -99,6 +99,21 @@ def test_without_a_feasible_one_the_nearest_to_it_comes_when_time_is_up(model: C
     assert not best.feasible[0]
 
 
+def test_the_best_of_candidates_is_of_one_pair_and_of_all_obstacles(model: ConFlow) -> None:
+    """Also of those that can be gone through only once."""
+    start, goal = CROWDS["weave"](8).scene(8, 0, 2)
+    obstacles = [(0.1, 0.1, 0.12), (-0.3, 0.2, 0.05)]
+    once = Planner(model).best_of(start, goal, num=4, obstacles=iter(obstacles))  # type: ignore[arg-type]
+    assert torch.equal(once.x, Planner(model).best_of(start, goal, num=4, obstacles=obstacles).x)
+    for said, refused in {
+        "start=tensor.*found shape": {"start": start[None], "goal": goal[None]},
+        "seed=x: expected a whole number": {"start": start, "goal": goal, "seed": "x"},
+        "seconds=x: expected a finite number": {"start": start, "goal": goal, "seconds": "x"},
+    }.items():
+        with pytest.raises(PlanError, match=f"^{said}"):
+            Planner(model).best_of(**refused)
+
+
 def test_the_audit_sees_what_happens_between_waypoints_and_at_the_ends(weave: CrowdTask) -> None:
     scene = weave.scene(8, 0, 0)
     line = torch.lerp(scene[None, :1], scene[None, 1:], torch.linspace(0, 1, 64)[None, :, None])
