@@ -71,10 +71,8 @@ def ablations(arguments: list[str]) -> None:
 
 def _any_code(options: "Mapping[str, str]") -> bool:
     """Whether runs of other code than the present are to be taken for those that are asked for."""
-    from conflow.errors import ConfigError
-
     if options["code"] not in ("same", "any"):
-        raise ConfigError(f"code={options['code']}: expected same or any")
+        raise errors.ConfigError(f"code={options['code']}: expected same or any")
     return options["code"] == "any"
 
 
@@ -308,10 +306,9 @@ def _exit_code(error: BaseException) -> int:
 
 def _reason(error: BaseException) -> str | None:
     """What a known failure says; None of any other."""
-    from conflow.errors import ConfigError
     from conflow.scene.errors import DemonstrationError
 
-    if isinstance(error, ConfigError | DemonstrationError):
+    if isinstance(error, errors.ConfigError | DemonstrationError):
         return str(error)
     text = textwrap.shorten(str(error), 200, placeholder=" ...")
     if isinstance(error, MemoryError) or re.search("can't allocate memory|out of memory", text):  # says torch

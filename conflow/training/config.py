@@ -29,7 +29,7 @@ Accelerator = Literal["auto", "cpu", "gpu", "mps"]
 SplitName = Literal["val", "test"]
 PAPERS_TASK = "swap"
 SWAPS = ("passing", "social", PAPERS_TASK)
-"""The tasks of two robots that swap sides."""
+"""The tasks of two robots that swap sides: here, since a mistyped setting is answered without torch."""
 Tree = dict[str, Any]
 
 SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
@@ -49,7 +49,7 @@ SIZES = (
     "train.val_every",
     "sample.num",
 )
-"""How much is computed: whole numbers that presets set, and that an ablation does not set but may multiply."""
+"""How much is computed: whole numbers that presets set, and that an ablation or a task may only multiply."""
 OF_SWAPS = ("data.horizon", "data.amplitudes", "data.jitter", "constraint.radius", "sample.obstacle.", "sample.radius")
 """Settings of SWAPS; another task has its own, `task.NAME`, or says in its file what these do."""
 MOST_NUMBERS = 64
@@ -236,7 +236,7 @@ def _plain(key: str, text: str) -> Any:
 
 
 def _factors(file: str, times: Any) -> dict[str, float]:
-    """What an ablation's block `times` multiplies, by the setting's dotted key.
+    """What the block `times` of a task or an ablation multiplies, by the setting's dotted key.
 
     Raises:
         ConfigError: names the file; a setting that is none of SIZES, or a factor that is no number above 0.
