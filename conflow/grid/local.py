@@ -124,9 +124,9 @@ def _train_all(cells: Sequence[Job], jobs: int, console: Console) -> None:
         for i, cell in enumerate(cells):
             cell.progress = Path(folder, str(i))
         task = display.add("cells", len(cells))
-        for thread in threads:
-            thread.start()
         try:
+            for thread in threads:
+                thread.start()
             while any(thread.is_alive() for thread in threads):
                 time.sleep(0.5)
                 for cell in cells:

@@ -49,7 +49,7 @@ def stopped_afterwards(*processes: "subprocess.Popen[str]") -> Iterator[None]:
             process.terminate()
         for process in processes:
             try:
-                process.communicate(timeout=60)
+                process.communicate(timeout=300)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()
@@ -129,7 +129,7 @@ def make_together(folders: Sequence[Path], experiment: str, uri: str | None = No
                 process.stdin.flush()
         else:
             for process in processes:
-                process.wait(timeout=60)
+                process.wait(timeout=300)
     errors_said = "\n".join(path.read_text() for folder in folders for path in folder.glob("errors *"))
     assert [process.returncode for process in processes] == [0] * len(folders), errors_said
 
@@ -181,7 +181,7 @@ def test_a_grid_finishes_while_the_pages_are_open_and_they_answer_throughout(tmp
             found = answered(f"{page}/api/2.0/mlflow/runs/search", question)
             seen.add(tuple(run["info"]["status"] for run in json.loads(found).get("runs", [])))
             time.sleep(0.2)
-        output, _ = grid.communicate(timeout=60)
+        output, _ = grid.communicate(timeout=300)
         assert ui.poll() is None
     assert grid.returncode == 0, output
     assert [run.info.status for run in runs(tmp_path)] == ["FINISHED", "FINISHED"]
