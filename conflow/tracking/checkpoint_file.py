@@ -1,6 +1,8 @@
 """A checkpoint on disk: written whole or not at all, read without running code. Needs torch alone."""
 
+import contextlib
 import os
+import uuid
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +28,8 @@ def write(path: Path, content: bytes | memoryview, previous: Path | None = None)
     Raises:
         CheckpointError: it could not be written; what was there is untouched.
     """
-    temporary = path.with_suffix(".tmp")
+    # Of its own, so that of two processes that write the same file neither gets half of the other's.
+    temporary = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
@@ -34,7 +37,8 @@ def write(path: Path, content: bytes | memoryview, previous: Path | None = None)
             file.flush()
             os.fsync(file.fileno())
         if previous is not None and path.exists():
-            path.replace(previous)
+            with contextlib.suppress(FileNotFoundError):  # the other was faster
+                path.replace(previous)
         temporary.replace(path)
         _sync(path.parent)
     except OSError as error:

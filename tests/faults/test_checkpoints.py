@@ -4,6 +4,7 @@ import errno
 import os
 import pickle
 import subprocess
+import threading
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,6 +48,35 @@ def test_the_newest_checkpoint_and_the_one_before_are_kept(tmp_path: Path) -> No
     assert sorted(path.name for path in tmp_path.iterdir()) == [checkpoints.LAST, checkpoints.PREVIOUS]
     assert checkpoint_file.load(tmp_path / checkpoints.LAST)["number"] == 2
     assert checkpoint_file.load(tmp_path / checkpoints.PREVIOUS)["number"] == 1
+
+
+def test_two_writers_of_a_checkpoint_leave_a_whole_one_at_any_time(tmp_path: Path) -> None:
+    path = tmp_path / checkpoints.LAST
+    errors: list[BaseException] = []
+
+    def write(number: int) -> None:
+        try:
+            for _ in range(40):
+                content = {"conflow": {}, "loops": {}, "w": torch.full((50_000,), number)}
+                AtomicCheckpointIO().save_checkpoint(content, path)
+        except BaseException as error:
+            errors.append(error)
+
+    writers = [threading.Thread(target=write, args=(number,)) for number in (1, 2)]
+    for writer in writers:
+        writer.start()
+    seen = 0
+    while any(writer.is_alive() for writer in writers):
+        for name in (checkpoints.LAST, checkpoints.PREVIOUS):
+            try:
+                found = checkpoint_file.load(tmp_path / name)["w"]
+            except FileNotFoundError:
+                continue
+            assert bool((found == found[0]).all())
+            seen += 1
+    assert errors == []
+    assert seen > 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == [checkpoints.LAST, checkpoints.PREVIOUS]
 
 
 def test_a_full_disk_leaves_the_checkpoint_that_was_there_and_nothing_else(disk: Path) -> None:
