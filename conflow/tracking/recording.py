@@ -63,11 +63,15 @@ class RunLogger(MLFlowLogger):
         run_id: the run.
         again: what the store has of a step already is not written a second time. A run that goes on from a checkpoint
             repeats the steps after it, with the same results.
+        claim: this process's hold on the run, without which nothing is written; none on a finished run, which is
+            anybody's to add to.
     """
 
-    def __init__(self, store: MlflowClient, run_id: str, again: bool = False) -> None:
+    def __init__(
+        self, store: MlflowClient, run_id: str, again: bool = False, claim: liveness.Claim | None = None
+    ) -> None:
         super().__init__(EXPERIMENT, tracking_uri=store_uri(), run_id=run_id)
-        self.store = store
+        self.store, self.claim = store, claim
         _ = self.experiment  # Lightning asks the store about it once: here, where no signal interrupts
         keys = store.get_run(run_id).data.metrics if again else ()
         self.written = {(key, point.step) for key in keys for point in store.get_metric_history(run_id, key)}
@@ -93,8 +97,13 @@ class RunLogger(MLFlowLogger):
         """`start` has logged the whole config."""
 
     def save(self) -> None:
-        """Write what is buffered, and up to when the run was at work."""
+        """Write what is buffered, and up to when the run was at work.
+
+        Raises:
+            LostRunError: the run is no longer this process's; nothing is written.
+        """
         with whole():
+            self._check()
             for i in range(0, len(self.buffer), 1000):
                 self.store.log_batch(str(self.run_id), metrics=self.buffer[i : i + 1000])
             if self.began is not None:
@@ -105,10 +114,15 @@ class RunLogger(MLFlowLogger):
     def log_files(self, folder: str) -> None:
         """Make everything in a folder an artifact of the run."""
         with whole():
+            self._check()
             self.store.log_artifacts(str(self.run_id), folder)
 
     def finalize(self, status: str = "success") -> None:
         self.save()
+
+    def _check(self) -> None:
+        if self.claim is not None:
+            self.claim.check()
 
 
 @contextmanager
@@ -116,7 +130,8 @@ def start(experiment: Experiment, resumed: Run | None = None) -> Iterator[RunLog
     """A run of an experiment, with its params, tags and data set, which ends with the status that is true.
 
     FINISHED when the block ends, KILLED when a signal interrupts it, FAILED when it raises. What not even gets to
-    say so, a process killed or a machine without power, is marked by the next `client`.
+    say so, a process killed or a machine without power, is marked by the next `client`. A run that another process has
+    taken meanwhile is left alone.
 
     Args:
         experiment: what it is of.
@@ -124,16 +139,18 @@ def start(experiment: Experiment, resumed: Run | None = None) -> Iterator[RunLog
 
     Raises:
         ConfigError: another process goes on with it already.
+        LostRunError: another process has taken it.
     """
     store = client()
     logger: RunLogger | None = None
     status = "FINISHED"
-    with liveness.claim(RUNS / "running") as lock:
+    with liveness.claim(RUNS / "running") as claim:
         try:
             # A signal between the store's commit and its answer would leave a run that nobody knows of to end.
             with held():
-                run_id = _create(store, experiment, lock) if resumed is None else _reopen(store, resumed, lock)
-                logger = RunLogger(store, run_id, again=resumed is not None)
+                run_id = _create(store, experiment, claim) if resumed is None else _reopen(store, resumed, claim)
+                claim.keep(store, run_id)
+                logger = RunLogger(store, run_id, again=resumed is not None, claim=claim)
                 logger.count(at_work(resumed) if resumed else 0.0)
             with whole():
                 _describe(store, run_id, experiment)
@@ -147,26 +164,40 @@ def start(experiment: Experiment, resumed: Run | None = None) -> Iterator[RunLog
                 _end(logger, status)
 
 
-def _create(store: MlflowClient, experiment: Experiment, lock: dict[str, str]) -> str:
+def _create(store: MlflowClient, experiment: Experiment, claim: liveness.Claim) -> str:
     folder = store.get_experiment_by_name(EXPERIMENT)
     assert folder is not None
     # With the run at once, not after it: by these tags it is found again, however early it is interrupted.
-    tags = {**experiment.tags, "pid": str(os.getpid()), "seconds": "0", **code.tags(), **origin(), **lock}
+    tags = {**experiment.tags, "pid": str(os.getpid()), "seconds": "0", **code.tags(), **origin(), **claim.tags()}
     return str(store.create_run(folder.experiment_id, run_name=experiment.name, tags=tags).info.run_id)
 
 
-def _reopen(store: MlflowClient, run: Run, lock: dict[str, str]) -> str:
-    run_id = str(run.info.run_id)
+def _reopen(store: MlflowClient, run: Run, claim: liveness.Claim) -> str:
+    run_id, tags = str(run.info.run_id), run.data.tags
+    running = ConfigError(f"resume={run.info.run_name}: expected an interrupted run, found one that is RUNNING")
     with FileLock(RUNS / ".store.lock"):
         if store.get_run(run_id).info.status == "RUNNING":
-            raise ConfigError(f"resume={run.info.run_name}: expected an interrupted run, found one that is RUNNING")
-        again = {"pid": str(os.getpid()), "resumed": str(int(run.data.tags.get("resumed", 0)) + 1)}
-        for key, value in (lock | again | code.tags_after(run.data.tags)).items():
+            raise running
+        again = {"pid": str(os.getpid()), "resumed": str(int(tags.get("resumed", 0)) + 1)}
+        # Of the attempts on several machines each is named.
+        machines = {"hardware": hardware(), "threads": str(torch.get_num_threads()), "hosts": platform.node()}
+        before = {"hosts": tags.get("host"), **tags}
+        machines = {key: _also(before.get(key), value) for key, value in machines.items()}
+        engine = {"engine_task": "none"} if "engine_task" in tags else {}  # unless it is an engine that goes on
+        for key, value in (engine | claim.tags() | again | machines | code.tags_after(tags)).items():
             store.set_tag(run_id, key, value)
-        if run.data.tags.get(liveness.NOTE) == liveness.GONE:  # no longer true of it
+        # Of two machines that the file lock does not keep apart the one goes on that wrote its lock last.
+        if store.get_run(run_id).data.tags["lock"] != claim.lock:
+            raise running
+        if tags.get(liveness.NOTE) == liveness.GONE:  # no longer true of it
             store.delete_tag(run_id, liveness.NOTE)
         store.update_run(run_id, status="RUNNING")
     return run_id
+
+
+def _also(before: str | None, now: str) -> str:
+    """What a tag says of all attempts at a run, each thing once."""
+    return "; ".join(dict.fromkeys([*(before.split("; ") if before else []), now]))
 
 
 def at_work(run: Run) -> float:
