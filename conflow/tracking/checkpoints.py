@@ -69,6 +69,8 @@ class Checkpoints(Callback):
             trainer.logger.save()  # a step before the checkpoint is not taken again, so its metrics must be safe
         trainer.save_checkpoint(self.path)
         self.saved = time.monotonic()
+        if trainer.logger is not None:
+            trainer.logger.after_save_checkpoint(self)  # type: ignore[arg-type]  # Lightning's own has a path too
 
 
 def newest(folder: Path) -> tuple[Path | None, int, list[str]]:

@@ -1,5 +1,6 @@
 """A run from its start to its end, and a Lightning logger that writes in batches."""
 
+import math
 import os
 import platform
 import re
@@ -24,7 +25,7 @@ from mlflow.exceptions import MlflowException
 
 from conflow import __version__
 from conflow.errors import ConfigError
-from conflow.tracking import code, liveness, signals
+from conflow.tracking import carried, code, liveness, signals
 from conflow.tracking.signals import held
 from conflow.tracking.store import EXPERIMENT, RUNS, checkpoints, client, store_uri, whole
 
@@ -78,6 +79,7 @@ class RunLogger(MLFlowLogger):
         self.buffer: list[Metric] = []
         self.flushed = time.monotonic()
         self.began: float | None = None
+        self.carried, self.carries = -math.inf, 0
 
     def count(self, before: float) -> None:
         """Keep from now on the tag `seconds`, for how long the run has been at work; `before` is what it has by now."""
@@ -116,6 +118,14 @@ class RunLogger(MLFlowLogger):
         with whole():
             self._check()
             self.store.log_artifacts(str(self.run_id), folder)
+
+    def after_save_checkpoint(self, checkpoint_callback: Any) -> None:
+        """Carry the checkpoint that was just saved, where that is asked for and was not done in the last minute."""
+        if carried.asked() and time.monotonic() - self.carried > carried.SECONDS:
+            with whole():
+                self._check()
+                carried.put(self.store, str(self.run_id), Path(checkpoint_callback.path), self.carries)
+            self.carried, self.carries = time.monotonic(), self.carries + 1
 
     def finalize(self, status: str = "success") -> None:
         self.save()
@@ -225,6 +235,7 @@ def _end(logger: RunLogger, status: str) -> None:
             logger.store.set_terminated(run_id, status)
             if status == "FINISHED":  # what such a run needs is among its artifacts
                 shutil.rmtree(checkpoints(run_id), ignore_errors=True)
+                carried.remove(logger.store, run_id)
         except Exception:
             # What ended the run is what its user must hear of; a later command marks it.
             if status == "FINISHED":

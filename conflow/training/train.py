@@ -12,7 +12,7 @@ from mlflow.entities import Run
 from rich.console import Console
 
 from conflow.scene.task import Task
-from conflow.tracking import checkpoints, recording, resume, store
+from conflow.tracking import carried, checkpoints, recording, resume, store
 from conflow.tracking.checkpoints import AtomicCheckpointIO, Checkpoints
 from conflow.training import summary
 from conflow.training.build import fitted, labels
@@ -127,6 +127,7 @@ def experiment(config: Config, data: DemonstrationData) -> recording.Experiment:
 def _continued(run: Run, asked: recording.Experiment, config: Config, console: Console, any_code: bool) -> Path | None:
     """The checkpoint from which a run goes on, or None from its beginning."""
     resume.check(run, asked, any_code)
+    carried.fetch(run)
     path, step, refused = checkpoints.newest(store.checkpoints(str(run.info.run_id)))
     for reason in refused:
         console.print(f"{reason}; going on from the one before it", highlight=False, soft_wrap=True)

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,20 +95,26 @@ class Server:
         return self.artifacts / path
 
 
-@pytest.fixture(scope="module")
-def server(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+@contextmanager
+def serving(database: str, folder: Path, address: str = "127.0.0.1") -> Iterator[Server]:
     """An MLflow server on the database, in a folder of its own."""
-    folder, port = tmp_path_factory.mktemp("server"), free_port()
+    port = free_port()
     command = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", database, "--workers", "1"]
-    command += ["--artifacts-destination", str(folder / "artifacts"), "--host", "127.0.0.1", "--port", str(port)]
+    command += ["--artifacts-destination", str(folder / "artifacts"), "--host", address, "--port", str(port)]
     quick = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
             command, cwd=folder, env=os.environ | quick, text=True, stdout=log, stderr=subprocess.STDOUT
         )
     with stopped_afterwards(process):
-        wait_for(f"http://127.0.0.1:{port}", process)
-        yield Server(f"http://127.0.0.1:{port}", folder / "artifacts")
+        wait_for(f"http://{address}:{port}", process)
+        yield Server(f"http://{address}:{port}", folder / "artifacts")
+
+
+@pytest.fixture(scope="module")
+def server(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(database, tmp_path_factory.mktemp("server")) as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
