@@ -200,12 +200,23 @@ def test_the_accelerator_is_no_part_of_what_an_experiment_is() -> None:
     assert here.train != there.train
     assert here.sha() == there.sha()
     assert "train.accelerator" not in config.flatten(here.identity())
+    later = config.flatten(config.LATER)
     assert config.flatten(here.tree()).keys() - config.flatten(here.identity()).keys() == {
         "train.accelerator",
-        "sample.descent",
+        *later,
     }
-    refined = config.load(["sample.descent=5"])  # which came later, and is none by default
-    assert config.flatten(refined.identity())["sample.descent"] == 5
+
+
+def test_a_setting_that_came_later_counts_where_it_is_not_its_default() -> None:
+    """`LATER` says what the defaults are, for planners that read no YAML."""
+    plain = config.load()
+    for key, default in config.flatten(config.LATER).items():
+        assert config.flatten(plain.tree())[key] == default
+    for argument, value in {"sample.descent=5": 5, "train.precision=bf16": "bf16"}.items():
+        other = config.load([argument])
+        assert config.flatten(other.identity())[argument.partition("=")[0]] == value
+        assert other.sha() != plain.sha()
+    assert config.load(["train.precision=32"]).sha() == plain.sha()
 
 
 @pytest.mark.parametrize(

@@ -206,6 +206,55 @@ def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not flow.sample(x_1, setting, noise()).requires_grad
 
 
+IN_BF16 = {
+    "resmlp": ["ablation=cgp"],
+    "spectral": ["ablation=plus", "source.fit=false"],
+    "attention": ["ablation=plus", "task=weave", "task.robots=[3]", "source.fit=false"],
+}
+
+
+@pytest.mark.parametrize("kind", IN_BF16)
+def test_in_bf16_the_layers_round_while_training_and_nothing_else_does(kind: str) -> None:
+    def made(precision: str) -> Training:
+        torch.manual_seed(0)
+        made = model_of(config.load(["preset=smoke", *IN_BF16[kind], f"train.precision={precision}"]))
+        torch.nn.init.normal_(made.v.outlet.weight, std=0.1)
+        return made
+
+    plain, half = made("32"), made("bf16")
+    x_1 = torch.rand(64, plain.T, plain.D, generator=noise()) - 0.5
+    M, dtypes = torch.ones(64, dtype=torch.bool), set()
+    for module in half.v.modules():
+        if isinstance(module, torch.nn.Linear):
+            module.register_forward_hook(lambda _, __, output: dtypes.add(output.dtype))
+    assert torch.equal(half.eval().loss(x_1, M, noise()), plain.eval().loss(x_1, M, noise()))
+    assert torch.equal(half.sample(x_1, "none", noise()), plain.sample(x_1, "none", noise()))
+    assert dtypes == {torch.float32}
+    dtypes.clear()
+    seen: list[torch.dtype] = []
+    half.u_c.register_forward_hook(lambda _, inputs, output: seen.extend([inputs[0].dtype, output.dtype]))
+    losses = [flow.train().loss(x_1, M, noise()) for flow in (half, plain)]
+    assert dtypes == {torch.bfloat16}
+    assert set(seen) == {losses[0].dtype} == {torch.float32}
+    rounded, exact = (
+        torch.cat([g.flatten() for g in torch.autograd.grad(loss, list(flow.v.parameters()))])
+        for loss, flow in zip(losses, (half, plain), strict=True)
+    )
+    assert not torch.equal(rounded, exact)
+    # A factor of 8 bits is off by 2^-9 at most, and there are some ten layers, forward and back.
+    assert (rounded - exact).norm() < 10 * 2**-8 * exact.norm()
+
+
+def test_the_closed_form_is_exact_in_bf16_too() -> None:
+    """Where h_theta is zero nothing is rounded, and start and goal are met to the last bit."""
+    plain, half = (model(*IN_BF16["spectral"], f"train.precision={precision}").train() for precision in ("32", "bf16"))
+    x_1 = swap(50)
+    x_t, t = half.source.sample(half.source.observe(x_1), noise()), torch.full((50,), 0.3)
+    assert torch.equal(half.v(x_t, t), plain.v(x_t, t))
+    torch.nn.init.normal_(half.v.outlet.weight, std=0.1)
+    assert not half.v(x_t, t)[:, [0, -1]].any()
+
+
 @pytest.mark.parametrize("ramp", [1, 3])
 def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes(ramp: int) -> None:
     """u_t = x_1 - x_0 + lambda t^ramp S grad C(x_t + (1 - t) v), by autograd, whatever M is, v held fixed in it."""

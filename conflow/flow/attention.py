@@ -63,11 +63,13 @@ class SpectralAttention(Spectral):
         others = near.masked_fill(torch.eye(near.shape[2], dtype=torch.bool, device=x.device)[..., None], 0)
         clock = torch.cat(self.clock(t), dim=1)[:, None].expand(-1, near.shape[2], -1)
         own = [self._by_robot(part) for part in (z, self.pushed(x), x[:, self.observed])]
-        h = self.inlet(torch.cat([*own, clock, others.amax(dim=2)], dim=2))
-        biases = self.closeness(others).permute(0, 3, 1, 2).chunk(len(self.blocks), dim=1)
-        for block, bias in zip(self.blocks, biases, strict=True):
-            h = block(h, bias)
-        return self.outlet(h).unflatten(2, (-1, self.each)).transpose(1, 2).flatten(2)
+        with self.layers(x):
+            h = self.inlet(torch.cat([*own, clock, others.amax(dim=2)], dim=2))
+            biases = self.closeness(others).permute(0, 3, 1, 2).chunk(len(self.blocks), dim=1)
+            for block, bias in zip(self.blocks, biases, strict=True):
+                h = block(h, bias)
+            h = self.outlet(h)
+        return h.to(z.dtype).unflatten(2, (-1, self.each)).transpose(1, 2).flatten(2)
 
     def _by_robot(self, z: Tensor) -> Tensor:
         """Numbers (batch, n, D) of each robot side by side, (batch, robots, n each)."""

@@ -1,6 +1,7 @@
 """The velocity networks v_theta: the paper's (appendix: "Architecture and training details"), and a spectral one."""
 
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +26,22 @@ class ResidualBlock(nn.Module):
         return h + self.layers(h)
 
 
-class ResMLP(nn.Module):
+class Velocity(nn.Module):
+    """What all velocity networks have: a precision of their layers.
+
+    Attributes:
+        bf16: whether the layers take bf16 factors while the network is trained. Weights, sums, all that is no layer,
+            and sampling stay in single precision.
+    """
+
+    bf16 = False
+
+    def layers(self, x: Tensor) -> AbstractContextManager[None]:
+        """Where the layers are evaluated, for an input on the device of x."""
+        return torch.autocast(x.device.type, torch.bfloat16) if self.bf16 and self.training else nullcontext()
+
+
+class ResMLP(Velocity):
     """v_theta(x, t): a residual MLP on the flattened trajectory and the scalar time.
 
     Args:
@@ -49,11 +65,12 @@ class ResMLP(nn.Module):
             if ends is None:
                 raise ValueError("ends: expected starts and goals, which this network sees, found none")
             seen.append(ends.flatten(1))
-        h = self.inlet(torch.cat(seen, dim=1))
-        return self.outlet(self.blocks(h)).view_as(x)
+        with self.layers(x):
+            v = self.outlet(self.blocks(self.inlet(torch.cat(seen, dim=1))))
+        return v.to(x.dtype).view_as(x)
 
 
-class Spectral(nn.Module, ABC):
+class Spectral(Velocity, ABC):
     """v_theta in the eigenvectors E of the source's Sigma: v(x, t) = E (a(t) z + c(t) h_theta), z = E^T (x - W x_O).
 
     Each mode has a variance sigma_0^2 under the source, its eigenvalue, and sigma_1^2 among the demonstrations. Were
@@ -167,4 +184,6 @@ class SpectralMLP(Spectral):
         pushed = self.pushed(x)
         near = 4 * self.constraint.clearance(x).clamp(max=1)  # only the near ones matter
         values = [z.flatten(1), x[:, self.observed].flatten(1), *self.clock(t), near, pushed.flatten(1)]
-        return self.outlet(self.blocks(self.inlet(torch.cat(values, dim=1)))).view_as(z)
+        with self.layers(x):
+            h = self.outlet(self.blocks(self.inlet(torch.cat(values, dim=1))))
+        return h.to(z.dtype).view_as(z)

@@ -25,6 +25,7 @@ CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "co
 
 Schedule = Literal["constant", "one_cycle"]
 Norm = Literal["waypoints", "modes"]
+Precision = Literal["32", "bf16"]
 Accelerator = Literal["auto", "cpu", "gpu", "mps"]
 SplitName = Literal["val", "test"]
 PAPERS_TASK = "swap"
@@ -37,7 +38,7 @@ SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
 
 OF_TASK = "task."
 """Begins the settings that are a task's own."""
-LATER: dict[str, Tree] = {"sample": {"descent": 0}}
+LATER: dict[str, Tree] = {"train": {"precision": "32"}, "sample": {"descent": 0}}
 """Settings that earlier runs lack, with their defaults: here, since a planner reads no YAML."""
 SIZES = (
     "data.num",
@@ -85,6 +86,7 @@ class Train:
     schedule: Schedule
     clip: Positive
     norm: Norm
+    precision: Precision
     log_every: Count
     val_every: Count
     accelerator: Accelerator
@@ -132,8 +134,8 @@ class Config:
     def identity(self) -> Tree:
         """The settings that say which experiment this is: all but the accelerator, on which it may go on elsewhere."""
         tree = self.tree() | {"task": self.task_name}
-        if not tree["sample"]["descent"]:
-            del tree["sample"]["descent"]  # runs from before there was such a thing are of the same experiment
+        for group, defaults in LATER.items():  # runs from before there was such a thing are of the same experiment
+            tree[group] = {name: value for name, value in tree[group].items() if defaults.get(name, ...) != value}
         del tree["train"]["accelerator"]
         if is_file(self.task):
             tree["task_code"] = code.of_file(Path(self.task))

@@ -53,6 +53,7 @@ class ConFlow(nn.Module):
             Mapping[str, Constraint], nn.ModuleDict({name: one.shaped(shape) for name, one in task.judged().items()})
         )
         self.v = build_network(config.network, self.source, task.robots, labels(config, task))
+        self.v.bf16 = config.train.precision == "bf16"
         self.u_c = build_correction(config.correction, kept(config, task), self.source)
         self.descending = descending(config, task, self.source)
         self.u_c_at_inference = cast(
