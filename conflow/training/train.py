@@ -20,6 +20,7 @@ from conflow.training.callbacks import TrainingLog, TrainingProgress, Validation
 from conflow.training.config import SPLITS, Config, SplitName, flatten
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import Evaluation, evaluate
+from conflow.training.forecast import Forecast
 from conflow.training.model import ConFlow
 from conflow.training.model_file import MODEL_FILE
 from conflow.training.module import DivergedError, Training
@@ -160,6 +161,7 @@ def trainer(config: Config, logger: recording.RunLogger, data: DemonstrationData
         devices=1,
         logger=logger,
         callbacks=[
+            Forecast(display.console),
             TrainingLog(config.train.log_every),
             TrainingProgress(display),
             ValidationSamples(data),
