@@ -1,0 +1,282 @@
+"""Constraints on arms: apart from each other, from themselves, from obstacles and the table, and not too fast."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from conflow.scene.arms import Arms, Body, Last, Sphere
+from conflow.scene.constraint import SHARED, Constraint, Pullback
+
+PART = 4
+"""Spheres of a body that are looked at together, at most."""
+FAR, FAR_FROM_ITSELF = 0.25, 0.1
+"""Metres beyond which gaps are not measured."""
+WAYPOINTS = 1024
+"""At which pairs of bodies are looked for at a time: what that takes stays in the cache."""
+ROWS = 128
+"""Trajectories that are swept at a time."""
+SEPARATE = 3
+"""Links of an arm that are so far apart along it may touch; nearer ones are held apart by their joints' limits."""
+
+
+class NearestPair(Constraint):
+    """Parts of arms keep apart: c is the gap between the nearest spheres of any two of them, |p - q| - r - r'.
+
+    Gaps beyond `far` are not measured, and count as that. Of all pairs of spheres few are looked at: a ball around each
+    part says how near its spheres are at least. At every waypoint the pair of parts for which that is smallest is
+    measured, and then those that may be nearer still. The result is that of all pairs.
+
+    Args:
+        robots: the arms.
+        bodies: (arm, body) each; obstacles are bodies on a base.
+        apart: whether two of them, (arm, body, arm, body), have to keep apart.
+        far: in metres.
+    """
+
+    robots: Arms
+
+    def __init__(
+        self,
+        robots: Arms,
+        bodies: Sequence[tuple[int, Body]],
+        apart: Callable[[int, Body, int, Body], bool],
+        far: float = FAR,
+    ) -> None:
+        super().__init__(robots)
+        self.far = far
+        parts = [(arm, Body(body.link, part)) for arm, body in bodies for part in _parts(body.spheres)]
+        self.arm, self.link = torch.tensor([(arm, body.link) for arm, body in parts]).T
+        # Parts with fewer spheres than another have their first one more often.
+        rows = [[*body.spheres, *[body.spheres[0]] * (PART - len(body.spheres))] for _, body in parts]
+        spheres = torch.tensor(rows, dtype=torch.float64)
+        centre = (spheres[..., :3].amin(dim=1) + spheres[..., :3].amax(dim=1)) / 2
+        self.local = F.pad(torch.cat([centre[:, None], spheres[..., :3]], dim=1), (0, 1), value=1.0)
+        self.radius = spheres[..., 3]
+        reach = (torch.linalg.vector_norm(spheres[..., :3] - centre[:, None], dim=2) + self.radius).amax(dim=1)
+        kept = torch.tensor(
+            [[i < j and apart(*one, *other) for j, other in enumerate(parts)] for i, one in enumerate(parts)]
+        )
+        self.i, self.j = kept.any(dim=1).nonzero()[:, 0], kept.any(dim=0).nonzero()[:, 0]
+        # What need not keep apart is as good as infinitely far.
+        self.reach = (reach[:, None] + reach).where(kept, -torch.inf)[self.i][:, self.j]
+        self._last: Last[Contact] = Last()
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return self._nearest(x).c.view(x.shape[:2])
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        near, robots = self._nearest(x), self.robots
+
+        def pullback(g: Tensor) -> Tensor:
+            # c = |p - q| - r - r' grows as p goes along u = (p - q) / |p - q|, and q against it.
+            away = g.reshape(-1, 1) * near.u
+            return robots.pull(x, self.arm[near.i], self.link[near.i], near.p, away) + robots.pull(
+                x, self.arm[near.j], self.link[near.j], near.q, -away
+            )
+
+        return near.c.view(*x.shape[:2], 1), pullback
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        # By subdividing, but few at a time: of a thousand all that it takes would be gigabytes.
+        return torch.cat([super(NearestPair, self).swept_clearance(rows) for rows in x.split(ROWS)])
+
+    def _nearest(self, x: Tensor) -> "Contact":
+        return self._last.of(x, self._found)
+
+    def _found(self, x: Tensor) -> "Contact":
+        found = [self._among(part) for part in self.robots.frames(x).split(WAYPOINTS, dim=4)]
+        return Contact(*map(torch.cat, zip(*found, strict=True)))
+
+    def _among(self, frames: Tensor) -> "Contact":
+        """The nearest pair at each of N waypoints."""
+        on = frames[self.link, :, :, self.arm]
+        # Every part's centre and its spheres', (parts, 1 + PART, 3, N).
+        points = (self.local.to(on) @ on.flatten(2)).unflatten(2, (3, -1))
+        centre = points[:, 0].movedim(1, 0)
+        least = _length(centre[:, self.i, None] - centre[:, None, self.j]) - self.reach.to(on)[..., None]
+        least = least.flatten(0, 1)
+        at_first, pair = least.min(dim=0)
+        found = self._measured(points, pair, torch.arange(len(pair)))
+        pair, n = ((least < found.c.clamp(max=self.far)) & (least > at_first)).nonzero(as_tuple=True)
+        if len(n):
+            others = self._measured(points, pair, n)
+            nearest = others.c.new_full(found.c.shape, torch.inf).scatter_reduce(0, n, others.c, "amin")
+            better = ((others.c == nearest[n]) & (others.c < found.c[n])).nonzero()[:, 0]
+            found = Contact(*(a.index_put((n[better],), b[better]) for a, b in zip(found, others, strict=True)))
+        return found._replace(c=found.c.clamp(max=self.far), u=found.u * (found.c < self.far)[:, None])
+
+    def _measured(self, points: Tensor, pair: Tensor, n: Tensor) -> "Contact":
+        """The nearest spheres of so many pairs of parts at waypoints n, all (M,)."""
+        i, j, N = self.i[pair // len(self.j)], self.j[pair % len(self.j)], points.shape[3]
+        # Whole rows of (3, PART, M): what is near in memory is taken together.
+        each = N * torch.arange(3 * PART + 3).unflatten(0, (-1, 3)).mT[:, 1:, None]
+        p, q = (points.flatten()[each + (one * (3 * PART + 3) * N + n)] for one in (i, j))
+        radius = self.radius.to(points).mT
+        gaps = _length(p[:, :, None] - q[:, None]) - (radius[:, i][:, None] + radius[:, j])
+        c, spheres = gaps.flatten(0, 1).min(dim=0)
+        p, q = (
+            one.take_along_dim(s.expand(3, 1, -1), dim=1)[:, 0]
+            for one, s in ((p, spheres // PART), (q, spheres % PART))
+        )
+        u = (p - q) / _length(p - q).clamp_min(SHARED)
+        return Contact(c, i, j, p.mT, q.mT, u.mT)
+
+
+class Contact(NamedTuple):
+    """The nearest spheres at N waypoints.
+
+    Attributes:
+        c: the gap between them, (N,).
+        i, j: their bodies, (N,).
+        p, q: their centres, (N, 3).
+        u: the unit vector from q to p, (N, 3); 0 where they share their centre.
+    """
+
+    c: Tensor
+    i: Tensor
+    j: Tensor
+    p: Tensor
+    q: Tensor
+    u: Tensor
+
+
+def _length(w: Tensor) -> Tensor:
+    """|w| of w (3, ...): `linalg.vector_norm` takes ten times as long along the first axis."""
+    x, y, z = w
+    return (x * x + y * y + z * z).sqrt()
+
+
+def _bodies(robots: Arms) -> list[tuple[int, Body]]:
+    return [(arm, body) for arm, chain in enumerate(robots.chains) for body in chain.bodies]
+
+
+def _parts(spheres: Sequence[Sphere]) -> list[Sequence[Sphere]]:
+    """As few parts as can be, of at most PART spheres each, as they follow each other."""
+    count = -(-len(spheres) // PART)
+    return [spheres[k * len(spheres) // count : (k + 1) * len(spheres) // count] for k in range(count)]
+
+
+def _other(a: int, _: Body, b: int, __: Body) -> bool:
+    return a != b
+
+
+def _separate(_: int, body: Body, __: int, other: Body) -> bool:
+    return other.link - body.link >= SEPARATE
+
+
+def _in_the_way(_: int, body: Body, __: int, other: Body) -> bool:
+    return body.link > 0 and other.link == 0
+
+
+class ArmAvoidance(NearestPair):
+    """No body of an arm touches one of another arm.
+
+    Raises:
+        ValueError: there is one arm alone.
+    """
+
+    def __init__(self, robots: Arms) -> None:
+        if len(robots.chains) < 2:
+            raise ValueError("one arm: expected two or more that avoid each other")
+        super().__init__(robots, _bodies(robots), _other)
+
+
+class SelfAvoidance(NearestPair):
+    """No body of an arm touches one of its own that is SEPARATE links away or more.
+
+    Args:
+        robots: the arms.
+        arm: which of them.
+    """
+
+    def __init__(self, robots: Arms, arm: int) -> None:
+        own = [one for one in _bodies(robots) if one[0] == arm]
+
+        super().__init__(robots, own, _separate, FAR_FROM_ITSELF)
+
+
+class SphereAvoidance(NearestPair):
+    """No body of an arm, but for its base, touches a sphere that stands in the workspace; of arms in the plane a disc.
+
+    Args:
+        robots: the arms.
+        spheres: (x, y, z, radius) each, in metres.
+
+    Raises:
+        ValueError: there is no sphere.
+    """
+
+    def __init__(self, robots: Arms, spheres: Sequence[Sphere]) -> None:
+        if not spheres:
+            raise ValueError("no spheres: expected one or more to stay clear of")
+        # A sphere that stands still is one on the first arm's base.
+        moving = [one for one in _bodies(robots) if one[1].link]
+        standing = [(0, Body(0, [robots.seen_from_base(sphere)])) for sphere in spheres]
+        super().__init__(robots, [*moving, *standing], _in_the_way)
+
+
+class Table(Constraint):
+    """Nothing that its first joint lifts touches the table the arms stand on: c is the smallest z - r of a sphere.
+
+    What is before the second joint turns about the vertical, and stays as high as it is.
+    """
+
+    robots: Arms
+
+    def __init__(self, robots: Arms, height: float = 0.0) -> None:
+        super().__init__(robots)
+        self.height = height
+        self.lifted = (robots.link > 1).nonzero()[:, 0]
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return self._gaps(x).amin(dim=0).view(x.shape[:2])
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        robots = self.robots
+        c, lowest = self._gaps(x).min(dim=0)
+        body = self.lifted[lowest]
+
+        def pullback(g: Tensor) -> Tensor:
+            local = F.pad(robots.local.to(x)[body], (0, 1), value=1.0)
+            on = robots.frames(x)[robots.link[body], :, :, robots.owner[body], torch.arange(len(body))]
+            up = F.pad(g.reshape(-1, 1), (2, 0))
+            return robots.pull(x, robots.owner[body], robots.link[body], torch.einsum("nk,nkc->nc", local, on), up)
+
+        return c.view(*x.shape[:2], 1), pullback
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        return torch.cat([super(Table, self).swept_clearance(rows) for rows in x.split(ROWS)])
+
+    def _gaps(self, x: Tensor) -> Tensor:
+        """z - r of every sphere, (spheres, batch T)."""
+        link, owner = self.robots.link[self.lifted], self.robots.owner[self.lifted]
+        local = F.pad(self.robots.local[self.lifted], (0, 1), value=1.0).to(x)
+        z = torch.einsum("sk,skn->sn", local, self.robots.frames(x)[link, :, 2, owner])
+        return z - (self.height + self.robots.radii[self.lifted].to(x))[:, None]
+
+
+class JointSpeed(Constraint):
+    """No joint turns faster than it can: c = min_j 1 - |q_{j,i+1} - q_{j,i}| / (dt limit_j), as a share of its limit.
+
+    At a waypoint the faster of the two steps beside it counts; between two waypoints the speed is that of the step.
+
+    Args:
+        robots: the arms, which know their limits.
+        dt: seconds from one waypoint to the next, the task's `dt`.
+    """
+
+    robots: Arms
+
+    def __init__(self, robots: Arms, dt: float) -> None:
+        super().__init__(robots)
+        self.longest = dt * robots.speed / robots.scale
+
+    def clearance(self, x: Tensor) -> Tensor:
+        c = self.swept_clearance(x)
+        return torch.minimum(torch.cat([c[:, :1], c], dim=1), torch.cat([c, c[:, -1:]], dim=1))
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        return 1 - (x.diff(dim=1) / self.longest.to(x)).abs().amax(dim=2)
