@@ -9,7 +9,7 @@ With a `model.ckpt` in place of a run in the store it needs torch and numpy alon
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from itertools import accumulate, count, islice
 from numbers import Integral, Real
 from pathlib import Path
@@ -24,10 +24,10 @@ from conflow.errors import ConfigError, brief, nearest
 from conflow.flow.correction import Correction, descend, descent
 from conflow.flow.sampler import Field, in_pieces, integrate
 from conflow.flow.source import Source
-from conflow.scene.constraint import Constraint, ObstacleAvoidance, Sum
+from conflow.scene.constraint import Constraint, Sum
 from conflow.scene.measures import leaves_workspace, smoothness
 from conflow.scene.robots import Crowd
-from conflow.scene.settings import Obstacle
+from conflow.scene.settings import Ball, Obstacle
 from conflow.scene.task import Task
 from conflow.training.build import MOMENTUM, NONE, barrier, descending, random_stream
 from conflow.training.config import Range
@@ -75,17 +75,14 @@ class Planner:
         model: on the CPU.
 
     Attributes:
-        scale, offset: the user's coordinates are `scale` x + `offset`, with x in workspace units.
+        scale, offset: the user's coordinates are `scale` x + `offset`, with x in workspace units, (D,) each.
+        length, origin: likewise `length` p + `origin` of bodies at p, where a configuration is not their positions.
     """
 
     def __init__(self, model: ConFlow) -> None:
         self.model = model.eval()
-        self.scale = float(model.task.scale)
-        try:
-            self.offset = torch.as_tensor(model.task.offset, dtype=torch.float32).expand(model.D)
-        except RuntimeError:
-            expected = f"expected a number, or {model.D}, one for each of a configuration"
-            raise PlanError(f"task {model.task.name}: offset={brief(model.task.offset)}: {expected}") from None
+        self.scale, self.offset = (self._each(name, getattr(model.task, name)) for name in ("scale", "offset"))
+        self.length, self.origin = model.task.length, model.task.origin
 
     @classmethod
     def load(cls, run: str | Path = "latest", task: Task | None = None) -> "Planner":
@@ -142,8 +139,9 @@ class Planner:
             start: configurations, such as (x1, y1, x2, y2, ...), (D,) or (B, D), in the user's units.
             goal: likewise, as many as starts.
             num: trajectories per pair.
-            obstacles: discs to avoid, each an `Obstacle` or (x, y, radius), in the user's units. They are guided around
-                and judged by; the network was not trained on them.
+            obstacles: discs to avoid, each an `Obstacle` or (x, y, radius), in the user's units; of arms in space
+                spheres, each a `Ball` or (x, y, z, radius). They are guided around and judged by; the network was not
+                trained on them.
             via: (s, position (D,)) for all pairs alike; s, between 0 and 1, is moved to the nearest inner waypoint.
             guidance: "all": around what training keeps, and around obstacles where there are some; the name of a
                 constraint of the training: around all of those alone; "obstacle": around the obstacles alone; "none" or
@@ -238,7 +236,7 @@ class Planner:
         for best in accumulate(tried, _better):
             passed = time.monotonic() - began
             if progress:
-                progress(passed, sized.scale * float(best.clearance))
+                progress(passed, sized.length * float(best.clearance))
             if bool(best.feasible) or passed > seconds:
                 break
         return sized._in_users_units(best)
@@ -259,16 +257,24 @@ class Planner:
     def _descending(self, discs: Sequence[Obstacle], index: Sequence[int]) -> Correction:
         """The correction that descent follows: of all that training keeps and of obstacles, at rest at waypoints O."""
         task, config = self.model.task, self.model.config
-        around = [ObstacleAvoidance(task.robots, [disc]) for disc in discs]
+        around = [task.avoidance([disc]) for disc in discs]
         return descending(config, task, self.model.source.condition(index), around)
+
+    def _each(self, name: str, value: float | Sequence[float]) -> Tensor:
+        """A number of the task's for each of D."""
+        try:
+            return torch.as_tensor(value, dtype=torch.float32).expand(self.model.D)
+        except RuntimeError:
+            expected = f"expected a number, or {self.model.D}, one for each of a configuration"
+            raise PlanError(f"task {self.model.task.name}: {name}={brief(value)}: {expected}") from None
 
     def _in_users_units(self, plans: Plans) -> Plans:
         x = plans.x if self._in_workspace_units() else self.scale * plans.x + self.offset
-        return Plans(x, self.scale * plans.clearance, plans.feasible, self.scale * plans.smoothness)
+        return Plans(x, self.length * plans.clearance, plans.feasible, self.length * plans.smoothness)
 
     def _in_workspace_units(self) -> bool:
         """Whether the user's units are those; then nothing is computed that could cost a bit."""
-        return self.scale == 1 and not bool(self.offset.any())
+        return bool((self.scale == 1).all()) and not bool(self.offset.any())
 
     def to_workspace(self, x: Tensor) -> Tensor:
         """Configurations x (..., D) of the user's units in workspace units."""
@@ -302,14 +308,14 @@ class Planner:
         return [self._disc(f"obstacles[{i}]", disc) for i, disc in enumerate(_items("obstacles", obstacles))]
 
     def _disc(self, name: str, disc: Obstacle | Sequence[float]) -> Obstacle:
-        """An obstacle in workspace units."""
+        """An obstacle in the bodies' units."""
         found = _obstacle(name, disc)
         if self._in_workspace_units():
             return found
-        x, y = (
-            (value - float(zero)) / self.scale for value, zero in zip((found.x, found.y), self.offset, strict=False)
-        )
-        return Obstacle(x, y, found.radius / self.scale)
+        x, y = ((value - zero) / self.length for value, zero in zip((found.x, found.y), self.origin, strict=True))
+        if isinstance(found, Ball):
+            return Ball(x, y, found.radius / self.length, found.z / self.length)
+        return Obstacle(x, y, found.radius / self.length)
 
     def _refuse_violation(self, name: str, y: Tensor, waypoint: int, met: Mapping[str, Constraint]) -> None:
         """Refuse configurations y (D,) or (B, D) that violate something at a waypoint: no plan with them is feasible.
@@ -325,7 +331,7 @@ class Planner:
             violates = (clearance < 0) & (constraint.clearance(elsewhere)[:, waypoint] < 0)
             if bool(violates.any()):
                 first = int(violates.nonzero()[0])
-                by = f"{self.scale * -float(clearance[first]):.3g}{_who(constraint, still[first, None], waypoint)}"
+                by = f"{self.length * -float(clearance[first]):.3g}{_who(constraint, still[first, None], waypoint)}"
                 _refuse(name, y, violates.view(y.shape[:-1]), f"violates {what} by {by}, expected not to")
 
     def _check_memory(self, num: int, pairs: int) -> None:
@@ -367,7 +373,7 @@ class Planner:
     def _avoidance(self, disc: Obstacle, margin: float = 0.0) -> Constraint:
         """A disc as a constraint with the run's barrier."""
         try:
-            return ObstacleAvoidance(self.model.task.robots, [disc]).shaped(barrier(self.model.config), margin)
+            return self.model.task.avoidance([disc]).shaped(barrier(self.model.config), margin)
         except ValueError as error:
             raise PlanError(str(error)) from None
 
@@ -513,13 +519,16 @@ def _via_points(via: Sequence[ViaPoint], T: int) -> dict[int, Numbers]:
 
 
 def _obstacle(name: str, value: Obstacle | Sequence[float]) -> Obstacle:
-    expected = "an Obstacle or (x, y, radius)"
-    triple = _numbers(name, astuple(value) if isinstance(value, Obstacle) else value, expected)
-    if triple.shape != (3,):
-        raise PlanError(f"{name}={brief(value)}: found shape {tuple(triple.shape)}, expected {expected}")
-    if not bool(triple.isfinite().all()) or not triple[2] > 0:
-        raise PlanError(f"{name}={_text(triple.tolist())}: expected finite numbers and a radius above 0")
-    return value if isinstance(value, Obstacle) else Obstacle(*(float(number) for number in value))
+    expected = "an Obstacle or (x, y, radius), in space a Ball or (x, y, z, radius)"
+    if isinstance(value, Obstacle):
+        value = (value.x, value.y, *([value.z] if isinstance(value, Ball) else []), value.radius)
+    numbers = _numbers(name, value, expected)
+    if numbers.shape not in ((3,), (4,)):
+        raise PlanError(f"{name}={brief(value)}: found shape {tuple(numbers.shape)}, expected {expected}")
+    if not bool(numbers.isfinite().all()) or not numbers[-1] > 0:
+        raise PlanError(f"{name}={_text(numbers.tolist())}: expected finite numbers and a radius above 0")
+    x, y, *z, radius = (float(number) for number in value)
+    return Ball(x, y, radius, *z) if z else Obstacle(x, y, radius)
 
 
 def _items(name: str, value: Iterable[Any]) -> list[Any]:

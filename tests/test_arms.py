@@ -250,6 +250,13 @@ def test_a_joint_has_the_speed_of_its_steps() -> None:
     assert c[0].tolist() == pytest.approx([left, left, 1.0])
 
 
+def test_a_joint_moves_the_links_beyond_it_and_no_other_arm() -> None:
+    g = torch.zeros(1, 1, 14)
+    g[..., 7 + 3] = 1.0  # joint 4 of the second arm
+    moved = PANDAS.moved(g)[0, 0]
+    assert torch.equal(moved, (PANDAS.owner == 1) & (PANDAS.link >= 4))
+
+
 def test_frames_follow_a_configuration_that_changes_in_place() -> None:
     """They are kept between constraints, but not beyond the tensor's next change."""
     constraint, x = ArmAvoidance(PANDAS), configurations(PANDAS)

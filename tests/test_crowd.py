@@ -105,15 +105,17 @@ def test_robots_of_weave_cross_straight_to_the_other_side() -> None:
 def test_a_scaled_world_has_room_for_more_robots_of_the_same_size(count: int) -> None:
     """In its own units discs have radius 0.05, and starts keep 0.15 but for their jitter."""
     made = CROWDS["scaled_weave"](count)
-    assert made.scale * made.robots.radius == pytest.approx(0.05)
-    assert (made.scale == 1) == (count == 10)
-    start = made.scale * made.scene(count, 0, 0)[0].view(count, 2).double()
+    scale = made.scale
+    assert isinstance(scale, float)
+    assert scale * made.robots.radius == pytest.approx(0.05)
+    assert (scale == 1) == (count == 10)
+    start = scale * made.scene(count, 0, 0)[0].view(count, 2).double()
     apart = (torch.cdist(start, start) + 9 * torch.eye(count)).min()
     assert float(apart) >= 0.149
     if count > 28:
         assert float(apart) <= 0.165
     same = CROWDS["scaled_weave"](10).of_numbers(2 * count)
-    assert (same.scale, float(same.robots.radii[0])) == (made.scale, made.robots.radius)
+    assert (same.scale, float(same.robots.radii[0])) == (scale, made.robots.radius)
 
 
 def test_robots_of_circle_swap_with_their_antipodes_nearly() -> None:

@@ -146,6 +146,7 @@ class Mine(conflow.Task):
             (f"{COMPLETE}    offset = {offset}\n", f"offset={offset}: expected a number, or 2, one for each of a")
             for offset in ("(1.0, 2.0, 3.0)", "[1.0]", "[[1.0, 2.0]]", "[]", "None", "[1.0, None]")
         ),
+        (COMPLETE + "    scale = (1.0, 2.0, 3.0)\n", "scale=(1.0, 2.0, 3.0): expected a number, or 2, one for each"),
         (
             "from conflow.scene import constraint\n"
             + COMPLETE.replace("conflow.Workspace", "constraint.RobotAvoidance"),
@@ -166,6 +167,7 @@ class Mine(conflow.Task):
         *("setting none", "constraint none", "setting refined", "constraint refined"),
         *("slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
         *("long offset", "short offset", "nested offset", "empty offset", "no offset", "half an offset"),
+        "long scale",
         "broken constraints",
         *("imported base", "imported task", "argument", "fails when made", "import"),
         *("exit", "no robot", "mistyped method", "no text"),

@@ -27,15 +27,15 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
     """
     figure = Figure(figsize=(4.6, 5.4), layout="constrained")
     axis = figure.add_subplot(aspect="equal")
-    task, reach = planner.model.task, 1.05 * planner.scale
-    middle = planner.offset[:2].tolist()
+    task, reach = planner.model.task, 1.05 * planner.length
+    middle, origin = planner.origin, torch.tensor(planner.origin)
     axis.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[-1] - reach, middle[-1] + reach))
     axis.set(xlabel="x", ylabel="y")
     axis.spines[["top", "right"]].set_visible(False)
     crowd = task.robots.count > NAMED
     best = "\nthe best one is drawn" if crowd else ""
     axis.set_title(f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible{best}")
-    paths = planner.scale * seen_from_above(task.robots, planner.to_workspace(plans.x)) + planner.offset[:2]
+    paths = planner.length * seen_from_above(task.robots, planner.to_workspace(plans.x)) + origin
     for body, robot in enumerate(task.robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]
         for shown, drawn in () if crowd else ((plans.feasible, colour), (~plans.feasible, COLLISION)):
@@ -47,12 +47,11 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
     axis.plot([], [], color=COLLISION, label="not feasible")
     axis.plot([], [], "o", color="black", ms=11, mfc="none", mew=2, label="goal")
     always = [
-        [*(planner.scale * torch.tensor(place) + planner.offset[:2]), planner.scale * radius]
-        for *place, radius in standing(task)
+        [*(planner.length * torch.tensor(place) + origin), planner.length * radius] for *place, radius in standing(task)
     ]
     for box in task.boxes():
-        x, y = (planner.scale * torch.tensor([box.x, box.y]) + planner.offset[:2]).tolist()
-        sizes = (planner.scale * size for size in (box.width, box.height, box.rounding))
+        x, y = (planner.length * torch.tensor([box.x, box.y]) + origin).tolist()
+        sizes = (planner.length * size for size in (box.width, box.height, box.rounding))
         axis.add_patch(rounded(Box(x, y, *sizes)))
     for x, y, radius in [*obstacles, *always]:
         axis.add_patch(Circle((x, y), radius, color=OBSTACLE, zorder=2.5))

@@ -186,6 +186,11 @@ class Arms(Robots):
         torque = (axis * (moment - torch.linalg.cross(origin, force, dim=1))).sum(dim=1)
         return self._numbers(torque.transpose(0, 1), x)
 
+    def moved(self, g: Tensor) -> Tensor:
+        turned = g.new_zeros(*g.shape[:2], len(self.chains), self.most + 1, dtype=torch.bool)
+        turned[..., self._arm, self._joint + 1] = g != 0
+        return turned.cummax(dim=3).values[..., self.owner, self.link]
+
     def pull(self, x: Tensor, arm: Tensor, link: Tensor, p: Tensor, g: Tensor) -> Tensor:
         """As `pullback`, of one g (batch T, 3) for each waypoint, at a point p (batch T, 3) of a link of an arm."""
         each = torch.arange(len(p))

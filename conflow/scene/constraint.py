@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from conflow.scene.robots import Robots
-from conflow.scene.settings import BarrierShape, Obstacle, Pairs, Reduction
+from conflow.scene.settings import Ball, BarrierShape, Obstacle, Pairs, Reduction
 
 SHARED = 1e-12
 """Two bodies that are nearer share a point."""
@@ -300,7 +300,7 @@ class ObstacleAvoidance(Avoidance):
         if not obstacles:
             raise ValueError("no obstacles: expected one or more to stay clear of")
         axes = robots.points(torch.zeros(1, 1, robots.D)).shape[3]
-        if axes != 2:
+        if axes != 2 or any(isinstance(one, Ball) for one in obstacles):
             raise ValueError(f"obstacles for bodies in {axes} dimensions: expected bodies in the plane, as discs are")
         bodies, among = len(robots.owner), len(obstacles)
         incidence = torch.eye(bodies).repeat_interleave(among, dim=0)
@@ -310,7 +310,7 @@ class ObstacleAvoidance(Avoidance):
 
 
 class Workspace(Constraint):
-    """Every body's centre stays within [-1, 1] on every axis: c = 1 - |p|.
+    """Every number of a configuration stays within [-1, 1]: c = 1 - |x|; for discs their centres, for arms the joints.
 
     Each wall counts for itself, at every waypoint: a robot in a corner is pushed away from both.
     """
@@ -323,12 +323,10 @@ class Workspace(Constraint):
         return self.clearances(x).amin(dim=2)
 
     def clearances(self, x: Tensor) -> Tensor:
-        return 1 - self.margin - self.robots.points(x).flatten(2).abs()
+        return 1 - self.margin - x.abs()
 
     def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
-        p = self.robots.points(x)
-        c = 1 - self.margin - p.flatten(2).abs()
-        return c, lambda g: self.robots.pullback(x, -p.sign() * g.unflatten(2, p.shape[2:]))
+        return self.clearances(x), lambda g: -x.sign() * g
 
     def swept_clearance(self, x: Tensor) -> Tensor:
         # A box is convex, so between two points inside nothing is nearer to a wall than one of them.

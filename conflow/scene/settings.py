@@ -49,6 +49,13 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
+class Ball(Obstacle):
+    """A sphere in space: an obstacle at height z."""
+
+    z: float = 0.0
+
+
+@dataclass(frozen=True)
 class Box:
     """A rectangle whose corners are rounded: centre (x, y), full size, and the radius of the corners."""
 

@@ -4,19 +4,21 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
-from conflow.scene.constraint import Constraint
+from conflow.scene.constraint import Constraint, ObstacleAvoidance
 from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.robots import Robots
-from conflow.scene.settings import Box
+from conflow.scene.settings import Box, Obstacle
 
 
 class Task(ABC):
     """Subclass this to bring a task of one's own; `robots`, `constraints` and `demonstrations` are all it takes.
 
     All is in workspace units: every number of a configuration lies in [-1, 1], with one common scale for positions, so
-    that distances stay distances. The user's coordinates are `scale` x + `offset`.
+    that distances stay distances. The user's coordinates are `scale` x + `offset`; of bodies, where a configuration is
+    something else than their positions, `length` p + `origin`.
 
     Starts and goals that models are asked for are those of demonstrations that were held out.
 
@@ -24,14 +26,14 @@ class Task(ABC):
         robots: what moves.
         T: waypoints of a trajectory.
         seconds: how long one takes.
-        scale: the user's units in a workspace unit.
-        offset: the user's coordinates of x = 0: a number, or one for each of D.
+        scale: the user's units in a workspace unit: a number, or one for each of D.
+        offset: the user's coordinates of x = 0, likewise.
     """
 
     robots: Robots
     T: int = 32
     seconds: float = 1.0
-    scale: float = 1.0
+    scale: float | Sequence[float] = 1.0
     offset: float | Sequence[float] = 0.0
 
     @property
@@ -44,6 +46,17 @@ class Task(ABC):
         """Seconds from one waypoint to the next."""
         return self.seconds / (self.T - 1)
 
+    @property
+    def length(self) -> float:
+        """The user's units of length in one of the bodies': as of configurations, where these are positions."""
+        return float(torch.as_tensor(self.scale).flatten()[0])
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """The user's coordinates of a body at (0, 0), likewise."""
+        x, y = torch.as_tensor(self.offset, dtype=torch.float64).flatten().repeat(2)[:2].tolist()
+        return x, y
+
     @abstractmethod
     def constraints(self) -> Mapping[str, Constraint]:
         """What training keeps, by name: it labels demonstrations, corrects, guides, and is measured."""
@@ -51,6 +64,10 @@ class Task(ABC):
     def constraints_at_inference(self) -> Mapping[str, Constraint]:
         """What appears at inference alone, by name: guided around where a setting says so, and measured."""
         return {}
+
+    def avoidance(self, obstacles: Sequence[Obstacle]) -> Constraint:
+        """What keeps the robots clear of obstacles that a planner is given."""
+        return ObstacleAvoidance(self.robots, obstacles)
 
     def settings(self) -> Mapping[str, Sequence[str]]:
         """What is evaluated beside `none`, by name: around which constraints sampling is guided.

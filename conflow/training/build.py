@@ -122,9 +122,10 @@ def checked(task: Task, name: str) -> Task:
     """
     if not hasattr(task, "robots"):
         raise ConfigError(f"task={name}: expected an attribute robots, such as conflow.Discs(count=1, radius=0.05)")
-    if not _fits(task.offset, task.robots.D):
-        expected = f"expected a number, or {task.robots.D}, one for each of a configuration"
-        raise ConfigError(f"task={name}: offset={brief(task.offset)}: {expected}")
+    for what, value in (("scale", task.scale), ("offset", task.offset)):
+        if not _fits(value, task.robots.D):
+            expected = f"expected a number, or {task.robots.D}, one for each of a configuration"
+            raise ConfigError(f"task={name}: {what}={brief(value)}: {expected}")
     trained, at_inference = {*task.constraints()}, {*task.constraints_at_inference()}
     known = trained | at_inference
     if not trained:
@@ -147,10 +148,10 @@ def checked(task: Task, name: str) -> Task:
     return task
 
 
-def _fits(offset: Any, D: int) -> bool:
-    """Whether an offset is a number, or D of them."""
+def _fits(value: Any, D: int) -> bool:
+    """Whether a scale or an offset is a number, or D of them."""
     try:
-        shape = torch.as_tensor(offset, dtype=torch.float32).shape
+        shape = torch.as_tensor(value, dtype=torch.float32).shape
     except (TypeError, ValueError, RuntimeError):
         return False
     return shape in ((), (D,))

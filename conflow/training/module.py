@@ -75,12 +75,14 @@ class Training(ConFlow, LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         # Plain numbers: of others, such as NumPy's, a file that is read without running code may hold none.
-        offset: float | list[float] = torch.as_tensor(self.task.offset, dtype=torch.float64).tolist()
+        scale, offset = (
+            torch.as_tensor(one, dtype=torch.float64).tolist() for one in (self.task.scale, self.task.offset)
+        )
         checkpoint["conflow"] = {
             "config": self.config.tree(),
             "T": self.T,
             "D": self.D,
             "threads": torch.get_num_threads(),
-            "scale": float(self.task.scale),
+            "scale": scale,
             "offset": offset,
         }
