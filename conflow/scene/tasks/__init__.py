@@ -7,7 +7,9 @@ from conflow.scene.tasks.circle import Circle
 from conflow.scene.tasks.crowd import CrowdTask
 from conflow.scene.tasks.dense import Basic, Dense
 from conflow.scene.tasks.maps import Conveyor, Highways, Room, Shelf
+from conflow.scene.tasks.pandas import Pandas
 from conflow.scene.tasks.passing import Passing
+from conflow.scene.tasks.planar_arms import PlanarArms
 from conflow.scene.tasks.random import Random
 from conflow.scene.tasks.social import Social
 from conflow.scene.tasks.swap import Swap
@@ -28,5 +30,7 @@ CROWDS: Mapping[str, Callable[..., CrowdTask]] = {
     "room": Room,
 }
 """Many robots, from demonstrations of single ones."""
-TASKS: Mapping[str, Callable[..., Task]] = {**SWAPS, **CROWDS}
+ARMS: Mapping[str, Callable[..., Task]] = {"planar_arms": PlanarArms, "pandas": Pandas}
+"""Two arms that share a workspace."""
+TASKS: Mapping[str, Callable[..., Task]] = {**SWAPS, **CROWDS, **ARMS}
 """By the name that `TASK=` chooses."""

@@ -1,0 +1,118 @@
+"""Two arms that share a workspace and swap sides: what all such tasks have in common."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from conflow.scene.arm_constraints import ArmAvoidance, JointSpeed, SelfAvoidance, SphereAvoidance, Table
+from conflow.scene.arms import Arms, Sphere
+from conflow.scene.constraint import Constraint, Sum
+from conflow.scene.settings import Ball, Obstacle
+from conflow.scene.task import Task
+from conflow.scene.tasks.curves import uniform
+from conflow.scene.tasks.passing import warped
+
+JITTER = 0.06
+"""Of every joint at both ends, in radians."""
+Known = Literal["training", "inference", "never"]
+
+
+class ArmTask(Task):
+    """Arms whose joints go from `start` to `goal` and evade on the way, independently of each other.
+
+    q(s) = p + s (q - p) + sin(pi s) b, with s a function of time that is another one for each arm, as in `passing`,
+    ends p and q jittered, and a deviation b of each arm's own. Configurations are the joints in radians, as shares of
+    their limits; lengths are in metres.
+
+    Args:
+        robots: the arms, all of the same kind.
+        spheres: obstacles (x, y, z, radius).
+        obstacles: when they are known: at training and after, at inference alone, or never, which is without them.
+        singles: of each arm so many trajectories alone are demonstrated, and joined at random; 0: as many as asked for.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    seconds = 4.0
+    robots: Arms
+
+    def __init__(self, robots: Arms, spheres: Sequence[Sphere], obstacles: Known, singles: int) -> None:
+        if obstacles not in get_args(Known):
+            raise ValueError(f"obstacles={obstacles}: expected one of {', '.join(get_args(Known))}")
+        if type(singles) is not int or singles < 0:
+            raise ValueError(f"singles={singles}: expected a whole number of at least 0")
+        self.robots, self.spheres, self.known, self.singles = robots, spheres, obstacles, singles
+        self.scale, self.offset = robots.scale.tolist(), robots.offset.tolist()
+
+    @property
+    def length(self) -> float:
+        return 1.0
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        return 0.0, 0.0
+
+    @property
+    @abstractmethod
+    def swept(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The joints of one arm at its nominal start and goal, in radians."""
+
+    @abstractmethod
+    def deviations(self, num: int, generator: torch.Generator) -> Tensor:
+        """b for `num` trajectories of all arms, float64 (num, arms, joints), in radians."""
+
+    def constraints(self) -> Mapping[str, Constraint]:
+        robots, count = self.robots, len(self.robots.chains)
+        kept: dict[str, Constraint] = {
+            "arms": ArmAvoidance(robots),
+            "self": Sum([SelfAvoidance(robots, arm) for arm in range(count)]),
+            "speed": JointSpeed(robots, self.dt),
+        }
+        kept |= {"table": Table(robots)} if robots.axes == 3 else {}
+        return kept | (self._around() if self.known == "training" else {})
+
+    def constraints_at_inference(self) -> Mapping[str, Constraint]:
+        return self._around() if self.known == "inference" else {}
+
+    def avoidance(self, obstacles: Sequence[Obstacle]) -> Constraint:
+        spheres = [(one.x, one.y, one.z if isinstance(one, Ball) else 0.0, one.radius) for one in obstacles]
+        if any(isinstance(one, Ball) != (self.robots.axes == 3) for one in obstacles):
+            raise ValueError(
+                f"obstacles for arms in {self.robots.axes} dimensions: expected as many numbers of a place"
+            )
+        return SphereAvoidance(self.robots, spheres)
+
+    def _around(self) -> dict[str, Constraint]:
+        return {"obstacle": SphereAvoidance(self.robots, self.spheres)}
+
+    def settings(self) -> Mapping[str, Sequence[str]]:
+        return {"all": tuple(self.constraints()), **{name: (name,) for name in self.constraints_at_inference()}}
+
+    def obstacles(self) -> Sequence[tuple[float, float, float]]:
+        return [] if self.known == "never" else [(x, y, radius) for x, y, _, radius in self.spheres]
+
+    def demonstrations(self, num: int, seed: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        q = self.drawn(self.singles or num, generator)
+        if self.singles:
+            count = len(self.robots.chains)
+            of_each = torch.randint(self.singles, (num, 1, count, 1), generator=generator)
+            q = q.unflatten(2, (count, -1)).take_along_dim(of_each, dim=0).flatten(2)
+        return self.robots.numbers(q).float()
+
+    def drawn(self, num: int, generator: torch.Generator) -> Tensor:
+        """Trajectories of all arms' joints in radians, float64 (num, T, D)."""
+        ends = torch.tensor(self.swept, dtype=torch.float64)
+        p, q = (
+            ends[:, None, None] + JITTER * uniform(generator, 2, num, len(self.robots.chains), ends.shape[1]).double()
+        )
+        s = warped(num, self.T, generator)[..., None]
+        wave = torch.from_numpy(np.sin((torch.pi * s).numpy()))
+        wave[:, :, -1] = 0  # sin(pi) in floating point is not
+        x = torch.lerp(p[:, :, None], q[:, :, None], s) + wave * self.deviations(num, generator)[:, :, None]
+        return x.transpose(1, 2).flatten(2)
