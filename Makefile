@@ -3,6 +3,8 @@
 TASK     ?= swap
 ABLATION ?= cgp
 SEED     ?= 0
+# Of one training; results are the same up to rounding.
+DEVICES  ?= 1
 PRESET   ?= quick
 SEEDS    ?= 0 1 2
 ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
@@ -31,6 +33,8 @@ PARALLEL := -n auto --dist loadfile
 # Where the examples in docstrings are run as well.
 EXAMPLES := conflow/flow conflow/scene conflow/planner.py
 CONFLOW = $(PYTHON) -m conflow
+# A process for each device.
+TOGETHER = $(if $(filter-out 1,$(DEVICES)),-m torch.distributed.run --standalone --nproc-per-node=$(DEVICES))
 # A task of one's own, which no run holds.
 OWN = $(if $(filter %.py,$(TASK)),task=$(TASK))
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
@@ -45,8 +49,8 @@ help:  ## List what can be made
 	@echo "  Tasks:     $(basename $(notdir $(wildcard conf/task/*.yaml))), or a file of your own: TASK=my_task.py"
 	@echo "  Presets:   $(basename $(notdir $(wildcard conf/preset/*.yaml)))"
 
-train: .venv/installed  ## Train, sample, evaluate and track one experiment: TASK= ABLATION= SEED= PRESET= SPLIT= ARGS=
-	@$(CONFLOW) train task=$(TASK) ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) split=$(SPLIT) $(ARGS)
+train: .venv/installed  ## Train, sample, evaluate and track one experiment: TASK= ABLATION= SEED= PRESET= SPLIT= DEVICES= ARGS=
+	@$(PYTHON) $(TOGETHER) -m conflow train task=$(TASK) ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) split=$(SPLIT) $(ARGS)
 
 ablations: .venv/installed  ## Train every ablation for every seed, and compare: TASK= SEEDS= ABLATIONS= PRESET= JOBS= SPLIT= ARGS=
 	@$(CONFLOW) ablations task=$(TASK) seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) split=$(SPLIT) $(ARGS)

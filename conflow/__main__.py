@@ -278,25 +278,37 @@ def guarded(command: "Callable[[list[str]], None]", arguments: list[str]) -> Non
 
 
 def console() -> "Console":
-    """Where commands print."""
+    """Where commands print; of several processes the first one."""
     from rich.console import Console
 
+    from conflow.tracking import ranks
+
+    if ranks.rank():
+        return Console(quiet=True)
     # Without a terminal rich assumes 80 columns, in which the tables would be all line breaks.
     found = Console()
     return found if found.is_terminal else Console(width=140)
 
 
 def _exit_code(error: BaseException) -> int:
-    """Known failures end in one line on stderr and an exit code; anything else is a bug and raised."""
-    from conflow.tracking import signals
+    """Known failures end in one line on stderr and an exit code; anything else is a bug and raised.
+
+    Of several processes that train together the first one says what all of them know.
+    """
+    from conflow.scene.errors import DemonstrationError
+    from conflow.tracking import ranks, signals
 
     if interrupted := signals.arrived():
-        print(f"conflow: interrupted by {interrupted}", file=sys.stderr)
+        if not ranks.rank():
+            print(f"conflow: interrupted by {interrupted}", file=sys.stderr)
         return interrupted.exit_code
     reason = _reason(error)
     if reason is None:
         raise error
-    print(_line(reason), file=sys.stderr)
+    if not ranks.rank():
+        print(_line(reason), file=sys.stderr)
+    elif not isinstance(error, errors.ConfigError | DemonstrationError) and not ranks.lost(error):
+        print(_line(f"rank {ranks.rank()}: {reason}"), file=sys.stderr)
     try:
         sys.stdout.flush()
     except OSError:  # nor will it take at the end what it did not take now
@@ -307,9 +319,12 @@ def _exit_code(error: BaseException) -> int:
 def _reason(error: BaseException) -> str | None:
     """What a known failure says; None of any other."""
     from conflow.scene.errors import DemonstrationError
+    from conflow.tracking import ranks
 
     if isinstance(error, errors.ConfigError | DemonstrationError):
         return str(error)
+    if ranks.lost(error):
+        return f"lost another of the {ranks.world()} processes that train together; try: ... resume=latest"
     text = textwrap.shorten(str(error), 200, placeholder=" ...")
     if isinstance(error, MemoryError) or re.search("can't allocate memory|out of memory", text):  # says torch
         return f"memory: {text or 'used up'}, expected a smaller network, batch, or number of trajectories"

@@ -29,13 +29,14 @@ def train(task: "Task | str" = config.PAPERS_TASK, ablation: str = "cgp", **sett
     from rich.console import Console
 
     from conflow.figures.workspace import of_training
+    from conflow.tracking import ranks
     from conflow.training.build import checked
     from conflow.training.memory import check_training
     from conflow.training.train import train
 
     check_training(chosen)
     own = None if isinstance(task, str) else checked(task, task.name)
-    return train(chosen, Console(), draw=of_training, task=own)
+    return train(chosen, Console(quiet=ranks.rank() > 0), draw=of_training, task=own)
 
 
 def compare(

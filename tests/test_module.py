@@ -255,6 +255,29 @@ def test_the_closed_form_is_exact_in_bf16_too() -> None:
     assert not half.v(x_t, t)[:, [0, -1]].any()
 
 
+LOSSES = [*IN_BF16.values(), ["ablation=guided_path"], ["ablation=end"], ["correction.mask=feasible"]]
+
+
+@pytest.mark.parametrize("arguments", LOSSES, ids=" ".join)
+def test_the_loss_of_a_batch_is_the_mean_of_its_shares_and_so_is_its_gradient(arguments: list[str]) -> None:
+    """Whatever is corrected in which share: each is a mean over all of its rows, with their own x_0 and t."""
+    flow = model_of(config.load(["preset=smoke", *arguments]))
+    torch.nn.init.normal_(flow.v.outlet.weight, std=0.1, generator=noise())
+    x_1 = torch.rand(32, flow.T, flow.D, generator=noise()) - 0.5
+    M = torch.arange(32) < 5  # all in the first share
+    shares = [slice(0, 8), slice(8, 16), slice(16, 24), slice(24, 32)]
+    parameters = list(flow.v.parameters())
+    losses = [flow.loss(x_1, M, noise(), rows) for rows in [slice(None), *shares]]
+    whole, *parts = (
+        torch.cat([g.flatten() for g in torch.autograd.grad(loss, parameters, allow_unused=True) if g is not None])
+        for loss in losses
+    )
+    # Single precision adds up in another order.
+    torch.testing.assert_close(torch.stack(losses[1:]).mean(), losses[0], rtol=1e-5, atol=0)
+    torch.testing.assert_close(torch.stack(parts).mean(dim=0), whole, rtol=1e-4, atol=1e-6 * float(whole.abs().max()))
+    assert not torch.allclose(parts[0], whole, rtol=0.01)
+
+
 @pytest.mark.parametrize("ramp", [1, 3])
 def test_the_correction_at_the_end_is_taken_where_the_network_says_the_path_goes(ramp: int) -> None:
     """u_t = x_1 - x_0 + lambda t^ramp S grad C(x_t + (1 - t) v), by autograd, whatever M is, v held fixed in it."""

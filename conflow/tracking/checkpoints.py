@@ -9,6 +9,7 @@ import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.plugins.io import CheckpointIO
 
+from conflow.tracking import ranks
 from conflow.tracking.checkpoint_file import CheckpointError, load, write
 
 SECONDS = 60.0
@@ -33,8 +34,8 @@ class AtomicCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """The checkpoint, as `load`, whatever Lightning asks for."""
-        return load(Path(path))
+        """The checkpoint, as `load`, whatever Lightning asks for; of several processes the first one reads it."""
+        return ranks.of_first(lambda: load(Path(path)))
 
     def remove_checkpoint(self, path: str | Path) -> None:
         Path(path).unlink(missing_ok=True)
@@ -55,7 +56,8 @@ class Checkpoints(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         # Where a validation follows, its results belong into what is saved: Lightning would not run it again.
-        if time.monotonic() - self.saved > SECONDS and trainer.global_step % self.val_every:
+        # Saving is for all processes at once, so it is the first one's clock that counts.
+        if trainer.global_step % self.val_every and ranks.first_says(time.monotonic() - self.saved > SECONDS):
             self._save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:

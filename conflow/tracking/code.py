@@ -18,11 +18,12 @@ DECISIVE = (
     "training/callbacks.py",  # what is measured during training
     "training/evaluation.py",  # what is sampled for validation and test
     "training/metrics.py",  # and how that is measured
+    "tracking/ranks.py",  # how a batch is shared
 )
 """The files under conflow/ that train and measure.
 
-Not among them: config.py, whose settings are compared by their values; what watches and stores a run, as tracking/;
-and what only reads it, as results/ and figures/.
+Not among them: config.py, whose settings are compared by their values; what watches and stores a run, as the rest of
+tracking/; and what only reads it, as results/ and figures/.
 """
 UNKNOWN = "unknown files"
 UNEXECUTED = ("annotation", "returns", "type_comment", "type_params")

@@ -247,14 +247,18 @@ def origin() -> dict[str, str]:
     # An installed package may lie in a repository that is not its own, such as its user's.
     ours = _git("ls-files", "--error-unmatch", Path(__file__).name) is not None
     sha, dirty = (_git("rev-parse", "HEAD"), _git("status", "--porcelain")) if ours else (None, None)
-    versions = {"conflow": __version__} | {name: version(name) for name in ("torch", "lightning", "mlflow")}
     return {
         "git_sha": sha if sha is not None else "unknown",
         "git_dirty": str(bool(dirty)).lower() if dirty is not None else "unknown",
-        "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
         "hardware": hardware(),
         "threads": str(torch.get_num_threads()),
     }
+
+
+def versions() -> dict[str, str]:
+    """Of this program and of the libraries that decide what a run is like."""
+    return {"conflow": __version__} | {name: version(name) for name in ("torch", "lightning", "mlflow")}
 
 
 def hardware() -> str:

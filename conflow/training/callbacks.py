@@ -1,5 +1,6 @@
 """What happens around the training loop: logging, progress, and evaluation under the three inference settings."""
 
+import signal
 import time
 from typing import Any
 
@@ -8,6 +9,7 @@ from lightning import Callback, Trainer
 from rich.progress import TaskID
 from torchmetrics import MetricCollection
 
+from conflow.tracking import ranks
 from conflow.training.build import random_stream
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.evaluation import cycle
@@ -18,12 +20,25 @@ from conflow.training.progress import ProgressDisplay
 VALIDATION_SAMPLES = 256
 
 
+class OwnSignals(Callback):
+    """Leaves SIGTERM to this program where there are several processes.
+
+    Lightning's handler would first tell it to the others, and wait for ever where one of them waits for this one.
+    """
+
+    def on_fit_start(self, trainer: Trainer, pl_module: Any) -> None:
+        self.own = signal.getsignal(signal.SIGTERM)
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        signal.signal(signal.SIGTERM, self.own)
+
+
 class TrainingLog(Callback):
     """train/loss, train/grad_norm, train/steps_per_second and train/seconds, every `log_every` steps.
 
-    Between two points nothing is read from the device, so the loop never waits for a number. What has been summed up
-    since the last one is part of a checkpoint. The seconds are those of training alone: during a validation and the
-    checkpoint after it the clock stands still.
+    Between two points nothing is read from the device, so the loop never waits for a number. What every process has
+    summed up since the last one is part of a checkpoint. The seconds are those of training alone: during a validation
+    and the checkpoint after it the clock stands still.
     """
 
     def __init__(self, log_every: int) -> None:
@@ -34,10 +49,13 @@ class TrainingLog(Callback):
         self.ticking: float | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return {"summed": self.summed, "loss": self.loss, "seconds": self.seconds}
+        losses = torch.stack(ranks.each(self.loss.cpu()))
+        return {"summed": self.summed, "loss": losses, "seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.summed, self.loss, self.seconds = (state_dict[key] for key in ("summed", "loss", "seconds"))
+        self.summed, self.seconds = state_dict["summed"], state_dict["seconds"]
+        losses = state_dict["loss"].reshape(-1)  # one number in a checkpoint from before there were several processes
+        self.loss = losses[ranks.rank()].clone() if len(losses) == ranks.world() else losses.mean()
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         self.since = trainer.global_step, self.seconds
@@ -56,17 +74,19 @@ class TrainingLog(Callback):
         self.loss += outputs["loss"]
         self.summed += 1
         step, (last, then) = trainer.global_step, self.since
-        if (step % self.log_every and step != trainer.max_steps) or trainer.logger is None:
+        if step % self.log_every and step != trainer.max_steps:
             return
-        pl_module.check_finite("the loss", self.loss, batch_idx)
+        loss = ranks.mean(self.loss)
+        pl_module.check_finite("the loss", loss, batch_idx)
         self._tick()
         metrics = {
-            "train/loss": float(self.loss) / self.summed,
+            "train/loss": float(loss) / self.summed,
             "train/grad_norm": float(pl_module.grad_norm),
             "train/steps_per_second": (step - last) / (self.seconds - then),
             "train/seconds": self.seconds,
         }
-        trainer.logger.log_metrics(metrics, step)
+        if trainer.logger is not None:
+            trainer.logger.log_metrics(metrics, step)
         self.loss.zero_()
         self.summed, self.since = 0, (step, self.seconds)
 

@@ -70,6 +70,11 @@ class Batches:
             self.step = step + 1
             yield x[i], violates[i]
 
+    @property
+    def sizes(self) -> list[int]:
+        """How many trajectories the batches have that are seen in turn."""
+        return [sum(count for _, count in parts) for parts in self.parts]
+
     def state_dict(self) -> dict[str, int]:
         return {"step": self.step}
 

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from conflow.errors import ConfigError, brief
+from conflow.tracking import ranks
 from conflow.training.config import Config
 
 
@@ -49,6 +50,11 @@ def check_training(config: Config) -> None:
     if not has[config.train.accelerator]:
         known = ", ".join(name for name, there in has.items() if there)
         raise ConfigError(f"train.accelerator={config.train.accelerator}: not on this machine, expected one of {known}")
+    if ranks.world() > 1 and config.train.accelerator != "cpu":
+        there = torch.cuda.device_count() if cuda else 0
+        if (cuda and there < ranks.on_node()) or (mps and not cuda):
+            found = f"{ranks.on_node()} processes on a machine that has {there} GPUs for them"
+            raise ConfigError(f"train.accelerator={config.train.accelerator}: found {found}, expected cpu")
     network, batch = config.network, config.train.batch_size
     size = 4 * config.data.horizon if config.data.path is None else 12
     weights = 2 * network.blocks * network.hidden**2

@@ -86,6 +86,10 @@ def _residual(x: Tensor, b: Tensor) -> Tensor:
     return (2 * x.cpu().double().flatten(1).var(dim=0).sum() - 2 * (b * b).mean() + b.mean() ** 2).clamp_min(0)
 
 
+ALONE = {"sync_on_compute": False}
+"""Of several processes that train one measures, and must not wait for the others to measure too."""
+
+
 class _Rate(Metric):
     """Fraction of trajectories that something holds for, with Wilson's interval.
 
@@ -97,7 +101,7 @@ class _Rate(Metric):
     total: Tensor
 
     def __init__(self, name: str) -> None:
-        super().__init__()
+        super().__init__(**ALONE)
         self.name = name
         self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
         self.add_state("total", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
@@ -182,7 +186,7 @@ class _Values(Metric):
     values: list[Tensor]
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(**ALONE)
         self.add_state("values", [], dist_reduce_fx="cat")
 
     def quantiles(self, names: Mapping[str, float]) -> dict[str, float]:

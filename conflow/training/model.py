@@ -30,6 +30,8 @@ from conflow.training.build import (
 )
 from conflow.training.config import Config
 
+ALL = slice(None)
+
 
 class ConFlow(nn.Module):
     """Constraint-guided flow matching.
@@ -98,12 +100,17 @@ class ConFlow(nn.Module):
         if isinstance(self.v, Spectral):
             self.v.fit(x_1)
 
-    def loss(self, x_1: Tensor, M: Tensor, noise: torch.Generator) -> Tensor:
-        """L_CG (Eq. cg_loss) for demonstrations x_1 (batch, T, D) and their violations M (batch,): Algorithm 1."""
-        lambda_c, ends = self.config.correction.lambda_c, start_and_goal(x_1)
-        M = M if self.config.correction.mask == "violates" else ~M
+    def loss(self, x_1: Tensor, M: Tensor, noise: torch.Generator, rows: slice = ALL) -> Tensor:
+        """L_CG (Eq. cg_loss) for demonstrations x_1 (batch, T, D) and their violations M (batch,): Algorithm 1.
+
+        Of some rows alone it is the mean over these, with the x_0 and t that they have in the whole batch. It is a mean
+        over all rows, corrected or not, so the mean over parts of equal size is the whole's, and so is its gradient.
+        """
         x_0 = self.source.sample(self.source.observe(x_1), noise)
         t = torch.rand(len(x_1), device=x_1.device, generator=noise)
+        x_0, x_1, t, M = x_0[rows], x_1[rows], t[rows], M[rows]
+        lambda_c, ends = self.config.correction.lambda_c, start_and_goal(x_1)
+        M = M if self.config.correction.mask == "violates" else ~M
         if self.config.correction.path == "guided":
             x_t, u_t = guided_path(x_0, x_1, t, self.u_c, lambda_c * M)
             return self.distance(self.v(x_t, t, ends), u_t)

@@ -11,6 +11,7 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from conflow.errors import ConfigError
 from conflow.scene.task import Task
+from conflow.tracking import ranks
 from conflow.training.build import random_stream
 from conflow.training.config import Config
 from conflow.training.model import ConFlow
@@ -28,8 +29,10 @@ class Training(ConFlow, LightningModule):
         self.grad_norm = torch.zeros(())
 
     def training_step(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
-        loss = self.loss(*batch, random_stream("training", self.config.seed, step, device=self.device))
-        if loss.device.type == "cpu":
+        noise = random_stream("training", self.config.seed, step, device=self.device)
+        loss = self.loss(*batch, noise, ranks.share(len(batch[0])))
+        # Of several processes one alone must not stop: to all of them the norm of the gradient tells it.
+        if loss.device.type == "cpu" and ranks.world() == 1:
             self.check_finite("the loss", loss, step)
         return loss
 
