@@ -9,6 +9,10 @@ PRESET   ?= quick
 SEEDS    ?= 0 1 2
 ABLATIONS ?= $(basename $(notdir $(wildcard conf/ablation/*.yaml)))
 JOBS     ?= 1
+# A Ray cluster for `make ablations`: auto or host:port; and what each cell gets of it.
+CLUSTER  ?=
+CPUS     ?= 1
+GPUS     ?= 0
 RUN      ?= latest
 # Tracks of people or robots, for `make demonstrations`.
 FROM     ?=
@@ -52,8 +56,9 @@ help:  ## List what can be made
 train: .venv/installed  ## Train, sample, evaluate and track one experiment: TASK= ABLATION= SEED= PRESET= SPLIT= DEVICES= ARGS=
 	@$(PYTHON) $(TOGETHER) -m conflow train task=$(TASK) ablation=$(ABLATION) seed=$(SEED) preset=$(PRESET) split=$(SPLIT) $(ARGS)
 
-ablations: .venv/installed  ## Train every ablation for every seed, and compare: TASK= SEEDS= ABLATIONS= PRESET= JOBS= SPLIT= ARGS=
-	@$(CONFLOW) ablations task=$(TASK) seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) split=$(SPLIT) $(ARGS)
+ablations: .venv/installed  ## Train every ablation for every seed, and compare: TASK= SEEDS= ABLATIONS= PRESET= JOBS= SPLIT= ARGS= CLUSTER=auto CPUS= GPUS=
+	@$(CONFLOW) ablations task=$(TASK) seeds="$(SEEDS)" ablations="$(ABLATIONS)" preset=$(PRESET) jobs=$(JOBS) split=$(SPLIT) \
+	$(if $(CLUSTER),cluster=$(CLUSTER) cpus=$(CPUS) gpus=$(GPUS)) $(ARGS)
 
 evaluate: .venv/installed  ## Sample a finished run again with other settings: RUN= SPLIT=val|test ARGS="sample.steps=50"
 	@$(CONFLOW) evaluate $(OWN) run=$(RUN) split=$(SPLIT) $(ARGS)

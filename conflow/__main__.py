@@ -12,6 +12,7 @@ from conflow import errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from types import ModuleType
 
     from rich.console import Console
 
@@ -42,7 +43,7 @@ def train(arguments: list[str]) -> None:
 def ablations(arguments: list[str]) -> None:
     """Train every ablation for every seed, what is not finished yet, and compare: seeds="0 1 2" ablations= jobs=1.
 
-    Methods are chosen by the validation split: split=val.
+    Methods are chosen by the validation split: split=val. On a Ray cluster: cluster=auto|host:port cpus=1 gpus=0.
     """
     from conflow import commandline
     from conflow.tracking import signals
@@ -50,23 +51,45 @@ def ablations(arguments: list[str]) -> None:
 
     signals.raise_on_signals()
     defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
-    options, settings = commandline.options(arguments, defaults | {"code": "same", "split": "val"})
+    defaults |= {"cluster": "", "cpus": "1", "gpus": "0", "code": "same", "split": "val"}
+    options, settings = commandline.options(arguments, defaults)
     any_code, split = _any_code(options), commandline.held_out(options)
-    jobs = commandline.whole(options, "jobs", 1, 1024)
+    jobs, cpus, gpus = (
+        commandline.whole(options, key, low, 1024) for key, low in (("jobs", 1), ("cpus", 1), ("gpus", 0))
+    )
     for key in ("seeds", "ablations"):
         if not options[key].split():
             raise errors.ConfigError(f"{key}={options[key]}: expected at least one")
     wanted = [f"preset={options['preset']}", *settings]
     memory.check_training(config.load(wanted))
 
-    from conflow.grid import local
     from conflow.results import comparison, printing
 
     terminal = console()
-    failed = local.run(options["ablations"].split(), options["seeds"].split(), wanted, jobs, terminal, any_code)
+    cells = options["ablations"].split(), options["seeds"].split(), wanted
+    if options["cluster"]:
+        cluster = _cluster(options["cluster"])
+        failed = cluster.run(*cells, options["cluster"], cpus, gpus, terminal, any_code)
+    else:
+        from conflow.grid import local
+
+        failed = local.run(*cells, jobs, terminal, any_code)
     printing.render([comparison.collect(options["preset"], settings, split)], "table", terminal)
     if failed:
         raise errors.ConfigError(f"{failed} cells failed; the same command tries them again")
+
+
+def _cluster(address: str) -> "ModuleType":
+    """What trains a grid with Ray, which most people do without."""
+    try:
+        from conflow.grid import cluster
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise errors.ConfigError(
+            f"cluster={address}: found no Ray, expected the extra of it; try: {sys.executable} -m pip install '.[cluster]'"
+        ) from None
+    return cluster
 
 
 def _any_code(options: "Mapping[str, str]") -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from conflow.grid.local import Job, _look, _train_all
+from conflow.grid.local import Job, _train_all
 from conflow.tracking import signals
 from conflow.training import config, progress
 from conflow.training.progress import ProgressDisplay
@@ -38,7 +38,7 @@ def test_a_grid_with_a_mistyped_cell_is_refused_before_any_is_started(argument: 
 def test_a_cells_progress_is_what_its_process_says_of_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its stages follow one another: training is 0.9 of the whole, sampling of either split half of the rest."""
     cell = Job([], config.load(), progress=tmp_path / "progress")
-    _look(cell)
+    cell.look(progress.read(tmp_path / "progress"))
     assert (cell.share, cell.note) == (0.0, ""), "it has said nothing yet"
     monkeypatch.setenv(progress.FILE, str(cell.progress))
     stages = {
@@ -50,11 +50,11 @@ def test_a_cells_progress_is_what_its_process_says_of_itself(tmp_path: Path, mon
         monkeypatch.setattr(progress, "FILE_SECONDS", -1.0)
         with ProgressDisplay(Console(quiet=True)) as display:
             display.update(display.add(name, total), completed)
-        _look(cell)
+        cell.look(progress.read(tmp_path / "progress"))
         assert cell.share == pytest.approx(share)
         assert cell.note == f"{name} {completed}/{total}"
     (tmp_path / "progress").write_text("train")
-    _look(cell)
+    cell.look(progress.read(tmp_path / "progress"))
     assert cell.share == 1, "what is being written is read the next time"
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from sqlalchemy import Engine, event
 
 from conflow import errors
-from conflow.grid.local import Job, _finished
+from conflow.grid.local import Job, finished
 from conflow.results.records import Record
 from conflow.scene.tasks.swap import swap
 from conflow.tracking import code, liveness, recording, resume, signals, store
@@ -288,9 +288,9 @@ def test_an_interrupted_run_is_found_although_one_of_its_name_has_finished_since
     assert {name: str(resume.find(name).info.run_id) for name in wanted} == {
         name: made[i] for name, i in wanted.items()
     }
-    for finished in ("smoke/cgp-s0", made[3]):
+    for ended in ("smoke/cgp-s0", made[3]):
         with pytest.raises(errors.ConfigError, match="expected an interrupted run, found one that is FINISHED"):
-            resume.find(finished)
+            resume.find(ended)
     with pytest.raises(errors.ConfigError, match=r"resume=logn/cgp-s0: no such run.*did you mean long/cgp-s0\?"):
         resume.find("logn/cgp-s0")
 
@@ -387,7 +387,7 @@ def test_a_grid_knows_its_cells_by_their_code_too(
 
     def seen(any_code: bool) -> tuple[bool, list[str], str]:
         cell = Job([], data.config)
-        return _finished(cell, any_code), cell.arguments, cell.again
+        return finished(cell, any_code), cell.arguments, cell.again
 
     again = [f"resume={run.info.run_id}"]
     assert seen(any_code=False) == (not resumes, again if resumes else [], "")
@@ -404,9 +404,9 @@ def test_labels_that_are_inverted_in_the_file_make_another_cell(store_folder: Pa
     settings = config.load(["preset=smoke", "data.path=mine.npz"])
     with recording.start(experiment(settings, DemonstrationData(settings))):
         pass
-    assert _finished(Job([], settings), any_code=False)
+    assert finished(Job([], settings), any_code=False)
     np.savez("mine.npz", x=x, violates=~labels)
-    assert not _finished(Job([], settings), any_code=False)
+    assert not finished(Job([], settings), any_code=False)
 
 
 def other_correction() -> Callable[[], Mapping[str, str]]:

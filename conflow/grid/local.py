@@ -48,6 +48,13 @@ class Job:
     def name(self) -> str:
         return self.config.name
 
+    def look(self, found: tuple[str, float, float] | None) -> None:
+        """Take its progress from what its process says: the stage, how much of it is done, and how much there is."""
+        if found:
+            stage, completed, total = found
+            before, share = STAGES.get(stage, (self.share, 0.0))
+            self.share, self.note = before + share * completed / total, f"{stage} {completed:g}/{total:g}"
+
 
 def run(
     ablations: Sequence[str],
@@ -74,29 +81,49 @@ def run(
     Raises:
         ConfigError: any of the cells cannot be asked for; then none is started.
     """
-    cells = [
-        Job(chosen, config.load(chosen))
-        for seed in seeds
-        for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
-    ]
-    todo = [cell for cell in cells if not _finished(cell, any_code)]
-    console.print(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before", highlight=False)
+    every = cells(ablations, seeds, arguments)
+    todo = [cell for cell in every if not finished(cell, any_code)]
+    console.print(f"{len(every)} cells, {len(every) - len(todo)} of them finished before", highlight=False)
     for cell in todo:
         if cell.again:
             console.print(f"{cell.name}: {cell.again}", highlight=False, soft_wrap=True)
     if todo:
         _train_all(todo, jobs, console)
-    for cell in todo:
+    return failures(todo, console)
+
+
+def cells(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]) -> list[Job]:
+    """Every ablation for every seed.
+
+    Raises:
+        ConfigError: any of them cannot be asked for.
+    """
+    return [
+        Job(chosen, config.load(chosen))
+        for seed in seeds
+        for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
+    ]
+
+
+def failures(cells: Sequence[Job], console: Console) -> int:
+    """Say of each cell that failed why; their number."""
+    for cell in cells:
         if cell.failed:
             console.print(
                 f"{cell.name} failed: {cell.output[-1] if cell.output else 'no output'}",
                 highlight=False,
                 soft_wrap=True,
             )
-    return sum(cell.failed for cell in todo)
+    return sum(cell.failed for cell in cells)
 
 
-def _finished(cell: Job, any_code: bool) -> bool:
+def overview(cells: Sequence[Job]) -> tuple[float, str]:
+    """How many cells are done, in tenths, and what those at work do."""
+    busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
+    return math.floor(10 * sum(cell.share for cell in cells)) / 10, busy
+
+
+def finished(cell: Job, any_code: bool) -> bool:
     """Whether a cell is; if it was interrupted, it is told to go on from there, and if by other code, why it is not."""
     try:
         digest = DemonstrationData(cell.config).digest
@@ -130,9 +157,8 @@ def _train_all(cells: Sequence[Job], jobs: int, console: Console) -> None:
             while any(thread.is_alive() for thread in threads):
                 time.sleep(0.5)
                 for cell in cells:
-                    _look(cell)
-                busy = " ".join(f"{cell.name} {cell.note}" for cell in cells if cell.note)
-                display.update(task, math.floor(10 * sum(cell.share for cell in cells)) / 10, busy)
+                    cell.look(progress.read(cell.progress) if cell.progress else None)
+                display.update(task, *overview(cells))
         except BaseException:
             with signals.held():
                 _stop(waiting, processes, threads)
@@ -179,12 +205,3 @@ def _work(waiting: "queue.SimpleQueue[Job]", processes: set[subprocess.Popen[str
         cell.failed = process.wait() != 0
         processes.discard(process)
         cell.share, cell.note, cell.progress = 1.0, "", None
-
-
-def _look(cell: Job) -> None:
-    """Take a cell's progress from what its process says."""
-    found = progress.read(cell.progress) if cell.progress else None
-    if found and found[0] in STAGES:
-        stage, completed, total = found
-        before, share = STAGES[stage]
-        cell.share, cell.note = before + share * completed / total, f"{stage} {completed:g}/{total:g}"

@@ -67,7 +67,7 @@ def client() -> MlflowClient:
     Runs whose process is gone are marked on the way, so that from here on none says RUNNING that is dead.
     """
     RUNS.mkdir(parents=True, exist_ok=True)
-    _check_reachable(store_uri())
+    check_reachable()
     local = store_uri() == local_uri()
     # A server decides itself where artifacts go.
     artifacts = None if store_uri().startswith("http") else (RUNS / "artifacts").absolute().as_uri()
@@ -114,12 +114,13 @@ def whole() -> AbstractContextManager[None]:
     return nullcontext() if store_uri().startswith("http") else held()
 
 
-def _check_reachable(uri: str) -> None:
+def check_reachable() -> None:
     """Refuse at once what MLflow would try again and again, for minutes and with a warning each time.
 
     Raises:
         ConfigError: the local store cannot be opened, or nobody answers where a server should.
     """
+    uri = store_uri()
     server = urlsplit(uri)
     try:
         if uri == local_uri() and (RUNS / "mlflow.db").exists():
