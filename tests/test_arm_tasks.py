@@ -9,7 +9,7 @@ from torch import Tensor
 
 from conflow.errors import ConfigError
 from conflow.planner import PlanError, Planner
-from conflow.scene.arm_constraints import SphereAvoidance
+from conflow.scene.arm_constraints import FAR, SphereAvoidance
 from conflow.scene.measures import leaves_workspace
 from conflow.scene.settings import Ball
 from conflow.scene.tasks import ARMS
@@ -31,7 +31,7 @@ def made(name: str, *arguments: str) -> tuple[ArmTask, Tensor]:
 
 @tasks
 def test_straight_ways_collide_and_some_that_evade_do_not(name: str) -> None:
-    """Arm against arm and nothing else; none at the ends, where arms are a quarter of a metre apart or more."""
+    """Arm against arm and nothing else; none at the ends, where arms are far apart."""
     task, x = made(name)
     s = torch.linspace(0, 1, task.T)[:, None]
     kept = task.constraints()
@@ -39,7 +39,7 @@ def test_straight_ways_collide_and_some_that_evade_do_not(name: str) -> None:
     assert 0.3 < kept["arms"].violation(x).float().mean() < 0.6
     assert not any(bool(one.violation(x).any()) for what, one in kept.items() if what != "arms")
     assert not bool(leaves_workspace(x).any())
-    assert bool((kept["arms"].clearance(x)[:, [0, -1]] == 0.25).all())
+    assert bool((kept["arms"].clearance(x)[:, [0, -1]] == FAR).all())
 
 
 @tasks

@@ -12,9 +12,9 @@ from conflow.scene.constraint import SHARED, Constraint, Pullback
 
 PART = 4
 """Spheres of a body that are looked at together, at most."""
-FAR, FAR_FROM_ITSELF = 0.25, 0.1
+FAR, FAR_FROM_ITSELF = 0.2, 0.05
 """Metres beyond which gaps are not measured."""
-WAYPOINTS = 1024
+WAYPOINTS = 512
 """At which pairs of bodies are looked for at a time: what that takes stays in the cache."""
 ROWS = 128
 """Trajectories that are swept at a time."""
@@ -95,18 +95,32 @@ class NearestPair(Constraint):
         on = frames[self.link, :, :, self.arm]
         # Every part's centre and its spheres', (parts, 1 + PART, 3, N).
         points = (self.local.to(on) @ on.flatten(2)).unflatten(2, (3, -1))
-        centre = points[:, 0].movedim(1, 0)
-        least = _length(centre[:, self.i, None] - centre[:, None, self.j]) - self.reach.to(on)[..., None]
-        least = least.flatten(0, 1)
-        at_first, pair = least.min(dim=0)
-        found = self._measured(points, pair, torch.arange(len(pair)))
-        pair, n = ((least < found.c.clamp(max=self.far)) & (least > at_first)).nonzero(as_tuple=True)
-        if len(n):
-            others = self._measured(points, pair, n)
-            nearest = others.c.new_full(found.c.shape, torch.inf).scatter_reduce(0, n, others.c, "amin")
-            better = ((others.c == nearest[n]) & (others.c < found.c[n])).nonzero()[:, 0]
-            found = Contact(*(a.index_put((n[better],), b[better]) for a, b in zip(found, others, strict=True)))
-        return found._replace(c=found.c.clamp(max=self.far), u=found.u * (found.c < self.far)[:, None])
+        n, pair, least = self._near(points[:, 0].detach())
+        bound = least.new_full(points.shape[3:], self.far)
+        at_first = bound.scatter_reduce(0, n, least, "amin")
+        first, c = least == at_first[n], points.new_full(bound.shape, self.far)
+        promising = self._measured(points, pair[first], n[first])
+        bound = bound.scatter_reduce(0, n[first], promising.c.detach(), "amin")
+        rest = ~first & (least < bound[n])
+        others = self._measured(points, pair[rest], n[rest])
+        found, n = Contact(*map(torch.cat, zip(promising, others, strict=True))), torch.cat([n[first], n[rest]])
+        c = c.scatter_reduce(0, n, found.c, "amin")
+        nearest = (found.c == c[n]) & (found.c < self.far)
+        i, j, p, q, u = (
+            one.new_zeros(len(c), *one.shape[1:]).index_put((n[nearest],), one[nearest]) for one in found[1:]
+        )
+        # What is not a number has no near pair, and no clearance either.
+        return Contact(c + 0 * points[:, 0].sum(dim=(0, 1)), i, j, p, q, u)
+
+    def _near(self, centre: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Waypoints n, pairs of parts that may be nearer than `far` there, and their least gaps, (M,) each."""
+        squares = centre.new_zeros(len(self.i), len(self.j), centre.shape[2])
+        for along in centre.unbind(dim=1):  # one axis after the other: all at once would leave the cache
+            apart = along[self.i, None] - along[self.j]
+            squares = squares.addcmul_(apart, apart)
+        reach, squares = self.reach.flatten().to(centre), squares.flatten(0, 1)
+        pair, n = (squares < (reach + self.far).clamp_min(0).square()[:, None]).nonzero(as_tuple=True)
+        return n, pair, squares[pair, n].sqrt() - reach[pair]
 
     def _measured(self, points: Tensor, pair: Tensor, n: Tensor) -> "Contact":
         """The nearest spheres of so many pairs of parts at waypoints n, all (M,)."""
@@ -118,8 +132,8 @@ class NearestPair(Constraint):
         gaps = _length(p[:, :, None] - q[:, None]) - (radius[:, i][:, None] + radius[:, j])
         c, spheres = gaps.flatten(0, 1).min(dim=0)
         p, q = (
-            one.take_along_dim(s.expand(3, 1, -1), dim=1)[:, 0]
-            for one, s in ((p, spheres // PART), (q, spheres % PART))
+            one.take_along_dim(sphere.expand(3, 1, -1), dim=1)[:, 0]
+            for one, sphere in ((p, spheres // PART), (q, spheres % PART))
         )
         u = (p - q) / _length(p - q).clamp_min(SHARED)
         return Contact(c, i, j, p.mT, q.mT, u.mT)

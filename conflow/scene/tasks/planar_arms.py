@@ -10,10 +10,10 @@ from conflow.scene.arms import Arms, Base, Body, Chain
 from conflow.scene.tasks.arms import ArmTask, Known
 from conflow.scene.tasks.curves import some, uniform
 
-LINKS, LENGTH, THICK = 4, 0.25, 0.03
+LINKS, LENGTH, THICK = 4, 0.25, 0.05
 DISCS = 5
 """Along each link."""
-BASE = 0.9
+BASE = 0.94
 """Of both arms, left and right of the middle."""
 SWEEP = pi / 4
 """Joint 1 goes from minus this to this; else the arms are straight at both ends."""
@@ -39,10 +39,14 @@ class PlanarArms(ArmTask):
     A fold h, uniform in [-0.1, `fold`], to either side: joint 2 turns by h, joint 3 by -2 h and joint 4 by h, which
     draws the hand in; joint 1 deviates by up to 0.25.
 
+    A step between two of 64 waypoints is shorter than the arms are thick, so that none passes through the other.
+
     Args:
         fold: the largest, in radians.
         obstacles, singles: of `ArmTask`.
     """
+
+    T = 64
 
     def __init__(self, fold: float = 1.3, obstacles: Known = "inference", singles: int = 0) -> None:
         if not isinstance(fold, int | float) or not 0 < fold <= 1.3:
