@@ -5,7 +5,7 @@ States are counts, sums or the values themselves, so batches of any size add up 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from scipy import stats
@@ -31,8 +31,8 @@ BERTH = 0.1
 """Robots that come nearer to touching than this, in workspace units, count as near."""
 REACHED = 0.01
 """Starts and goals count as reached within this `endpoint_error`, in workspace units per robot."""
-PAIR_ROWS, PAIR_COLUMNS = 1000, 10_000
-"""Distances held at a time: 80 MB, where all pairs of 10,000 trajectories would take 800 MB."""
+BLOCK = 1024
+"""Rows and columns of the distances held at a time: 8 MB, where all of 10,000 trajectories would take 800 MB."""
 
 
 def wilson(count: int, total: int) -> tuple[float, float]:
@@ -63,19 +63,38 @@ def quantile_interval(values: Tensor, q: float) -> tuple[float, float]:
     return low, high
 
 
-def _distance_sums(x: Tensor, y: Tensor) -> Tensor:
-    """sum_j |x_i - y_j| over all T D numbers for x (n, T, D) and y (m, T, D), (n,).
+def _blocks(x: Tensor) -> Sequence[Tensor]:
+    """Trajectories (n, T, D) as rows of T D numbers, BLOCK at a time.
 
     In double precision, which not every accelerator has: cdist takes |x|^2 + |y|^2 - 2 <x, y>, which in single
     precision puts equal trajectories some 1e-3 apart, as much as the energy distance of a good model, and a collapsed
     one would look diverse.
     """
-    x, columns = x.cpu(), y.cpu().flatten(1).split(PAIR_COLUMNS)
+    return x.cpu().double().flatten(1).split(BLOCK)
 
-    def sums(rows: Tensor) -> Tensor:
-        return torch.stack([torch.cdist(rows.double(), part.double()).sum(dim=1) for part in columns]).sum(dim=0)
 
-    return torch.cat([sums(rows) for rows in x.flatten(1).split(PAIR_ROWS)])
+def _mean_distances(x: Tensor) -> Tensor:
+    """The mean distance |x_i - x_j| over all T D numbers of each of x (n, T, D) to the others, (n,)."""
+    blocks = _blocks(x)
+    sums = [torch.zeros(len(block), dtype=torch.float64) for block in blocks]
+    for i, rows in enumerate(blocks):
+        sums[i] += torch.cdist(rows, rows).sum(dim=1)
+        for j, columns in enumerate(blocks[:i]):  # a pair of blocks counts for both
+            d = torch.cdist(rows, columns)
+            sums[i] += d.sum(dim=1)
+            sums[j] += d.sum(dim=0)
+    return torch.cat(sums) / (len(x) - 1)
+
+
+def _mean_distances_between(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean distance of each of x (n, T, D) to the y (m, T, D), (n,), and of each y to the x, (m,)."""
+    to_y: list[Tensor] = []
+    to_x = torch.zeros(len(y), dtype=torch.float64)
+    for rows in _blocks(x):
+        d = torch.cat([torch.cdist(rows, columns) for columns in _blocks(y)], dim=1)
+        to_y.append(d.mean(dim=1))
+        to_x += d.sum(dim=0)
+    return torch.cat(to_y), to_x / len(x)
 
 
 def _residual(x: Tensor, b: Tensor) -> Tensor:
@@ -262,10 +281,12 @@ class Diversity(_Values):
         self.values.append(x)
 
     def compute(self) -> dict[str, float]:
-        x = dim_zero_cat(self.values)
-        n = len(x)
-        h = _distance_sums(x, x) / (n - 1)
-        mean, spread = float(h.mean()), 2 * Z * float(h.std()) / math.sqrt(n)
+        return self.estimate(_mean_distances(dim_zero_cat(self.values)))
+
+    @staticmethod
+    def estimate(h: Tensor) -> dict[str, float]:
+        """From the mean distances h (n,)."""
+        mean, spread = float(h.mean()), 2 * Z * float(h.std()) / math.sqrt(len(h))
         return {"diversity": mean, "diversity_low": mean - spread, "diversity_high": mean + spread}
 
 
@@ -296,10 +317,15 @@ class EnergyDistance(_Values):
         self.values.append(x)
 
     def compute(self) -> dict[str, float]:
-        x, y = dim_zero_cat(self.values), self.reference
+        x = dim_zero_cat(self.values)
+        return self.estimate(x, _mean_distances(x))
+
+    def estimate(self, x: Tensor, b_x: Tensor) -> dict[str, float]:
+        """Of x (n, T, D) with the mean distances b_x (n,) to each other."""
+        y = self.reference
         n, m = len(x), len(y)
-        b_x, b_y = _distance_sums(x, x) / (n - 1), _distance_sums(y, y) / (m - 1)
-        h, k = _distance_sums(x, y) / m - b_x, _distance_sums(y, x) / n - b_y
+        (a_x, a_y), b_y = _mean_distances_between(x, y), _mean_distances(y)
+        h, k = a_x - b_x, a_y - b_y
         distance = float(h.mean() + k.mean())
         degenerate = 2 * (_residual(x, b_x).sqrt() / n + _residual(y, b_y).sqrt() / m) ** 2
         spread = Z * math.sqrt(float(4 * h.var() / n + 4 * k.var() / m + degenerate))
@@ -308,6 +334,15 @@ class EnergyDistance(_Values):
             "energy_distance_low": distance - spread,
             "energy_distance_high": distance + spread,
         }
+
+
+class DiversityAndEnergyDistance(EnergyDistance):
+    """Both at once: the distances between generated trajectories, the most of the work, are the same."""
+
+    def compute(self) -> dict[str, float]:
+        x = dim_zero_cat(self.values)
+        b_x = _mean_distances(x)
+        return Diversity.estimate(b_x) | self.estimate(x, b_x)
 
 
 def trajectory_metrics(
@@ -335,8 +370,6 @@ def trajectory_metrics(
         "path_length": PathLength(robots),
         "start_error": EndpointError(robots, "start_error", 0),
         "end_error": EndpointError(robots, "end_error", -1),
-        "diversity": Diversity(),
+        "distances": Diversity() if reference is None else DiversityAndEnergyDistance(reference),
     }
-    if reference is not None:
-        metrics["energy_distance"] = EnergyDistance(reference)
     return MetricCollection(metrics, compute_groups=False)
