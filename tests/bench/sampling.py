@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import Linear
 
 from conflow.flow.sampler import Field, integrate
 from conflow.flow.settings import Solver
@@ -32,6 +33,7 @@ GPYTORCH = Target(20, at_most=False)
 BARE, BARE_TARGET = "the bare network as often", Target(1.05)
 FEW = Target(10, at_most=False)
 HELP = Target(0.5)
+PRODUCTS, PRODUCTS_TARGET = "its layers' matrix products alone", Target(3)
 
 
 def source(pace: Pace) -> list[Row]:
@@ -90,9 +92,27 @@ def plan(pace: Pace) -> list[Row]:
     v, y = model.field("robot"), torch.tensor([START, GOAL]).expand(PLANS, 2, model.D)
     solved = _solved(v, model.source.sample(y), sample.steps, sample.solver)
     run = block(partial(planner.plan, START, GOAL, PLANS))
+    others = {PRODUCTS: _products(model)} | solved
     p50, p99 = (1000 * one for one in np.quantile([run(1) for _ in range(LATENCIES)], [0.5, 0.99]))
     note = f"p50 {p50:.1f} ms, p99 {p99:.1f} ms of {LATENCIES}"
-    return beside(f"one plan of {PLANS} by plus", "planner.plan", run, solved, pace, "time", note=note)
+    return beside(
+        f"one plan of {PLANS} by plus", "planner.plan", run, others, pace, "time", {PRODUCTS: PRODUCTS_TARGET}, note
+    )
+
+
+def _products(model: ConFlow) -> Block:
+    """The matrix products of the network's layers for PLANS trajectories, as often as a plan evaluates them."""
+    layers = [
+        (torch.randn(PLANS, one.in_features), one.weight.T) for one in model.v.modules() if isinstance(one, Linear)
+    ]
+    sample = model.config.sample
+
+    def products() -> None:
+        for _ in range(sample.steps * EVALUATIONS[sample.solver]):
+            for h, W in layers:
+                h @ W
+
+    return block(products)
 
 
 def demonstrations() -> list[Row]:
