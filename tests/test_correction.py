@@ -29,6 +29,9 @@ class Quadratic:
     def gradient(self, x: Tensor) -> Tensor:
         return x
 
+    def clearance_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.clearance(x), self.gradient(x)
+
     def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
         return self.barrier(x), self.gradient(x)
 

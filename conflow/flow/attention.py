@@ -62,7 +62,7 @@ class SpectralAttention(Spectral):
         near = self._near(x)
         others = near.masked_fill(torch.eye(near.shape[2], dtype=torch.bool, device=x.device)[..., None], 0)
         clock = torch.cat(self.clock(t), dim=1)[:, None].expand(-1, near.shape[2], -1)
-        own = [self._by_robot(part) for part in (z, self.pushed(x), x[:, self.observed])]
+        own = [self._by_robot(part) for part in (z, self.pushed(self.constraint.gradient(x)), x[:, self.observed])]
         with self.layers(x):
             h = self.inlet(torch.cat([*own, clock, others.amax(dim=2)], dim=2))
             biases = self.closeness(others).permute(0, 3, 1, 2).chunk(len(self.blocks), dim=1)

@@ -7,6 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from conflow.flow.along import along
 from conflow.flow.settings import Edges
 from conflow.flow.threads import one_thread
 
@@ -24,6 +25,10 @@ class Differentiable(Protocol):
 
     def gradient(self, x: Tensor) -> Tensor:
         """grad C at x, both (batch, T, D)."""
+        ...
+
+    def clearance_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """c and grad C."""
         ...
 
     def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -49,7 +54,7 @@ class Correction(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """u^c at x, both (batch, T, D)."""
-        return (self.constraint.gradient(x).mT @ self.smoothing.mT).mT
+        return along(self.smoothing, self.constraint.gradient(x))
 
 
 @one_thread()
@@ -100,7 +105,7 @@ def descent(x: Tensor, u_c: Correction, momentum: float = 0.0) -> Iterator[Tenso
     while True:
         yield x
         C, g = u_c.constraint.barrier_and_gradient(x)
-        moving = (u_c.smoothing @ g) * (C < 0)[:, None, None]
+        moving = along(u_c.smoothing, g) * (C < 0)[:, None, None]
         slope = (g * moving).sum(dim=(1, 2))
         step = torch.where(slope > 0, -C / slope.clamp_min(torch.finfo(x.dtype).tiny), 0)[:, None, None] * moving
         V = momentum * V * (C < 0)[:, None, None] + step

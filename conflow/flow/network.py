@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor, nn
 
+from conflow.flow.along import along
 from conflow.flow.correction import Differentiable
 from conflow.flow.source import Source
 
@@ -91,8 +92,8 @@ class Spectral(Velocity, ABC):
     """
 
     observed: Tensor
-    mean_map: Tensor
     modes: Tensor
+    analysis: Tensor
     source_variance: Tensor
     variance: Tensor
     frequencies: Tensor
@@ -103,8 +104,8 @@ class Spectral(Velocity, ABC):
         self.constraint = constraint
         m, dtype = source.modes.shape[1], torch.get_default_dtype()
         self.register_buffer("observed", source.index, persistent=False)
-        self.register_buffer("mean_map", source.mean_map.to(dtype), persistent=False)
         self.register_buffer("modes", source.modes.to(dtype), persistent=False)
+        self.register_buffer("analysis", _analysis(source).to(dtype), persistent=False)
         self.register_buffer("source_variance", source.variance.to(dtype)[:, None].expand(m, D), persistent=False)
         # Of the demonstrations, so a checkpoint has to hold it.
         self.register_buffer("variance", self.source_variance.clone())
@@ -119,7 +120,7 @@ class Spectral(Velocity, ABC):
 
     def coordinates(self, x: Tensor) -> Tensor:
         """z = E^T (x - W x_O), (batch, m, D)."""
-        return self.modes.mT @ (x - self.mean_map @ x[:, self.observed])
+        return along(self.analysis, x)
 
     def balanced(self, u: Tensor) -> Tensor:
         """A velocity u (batch, T, D) in the modes, each over the root of its sigma_1, (batch, m, D).
@@ -130,15 +131,16 @@ class Spectral(Velocity, ABC):
         in closed form.
         """
         sigma_1 = self.variance.sqrt()
-        return (sigma_1[0] / sigma_1).clamp(max=NARROWEST).sqrt() * (self.modes.mT @ u)
+        return (sigma_1[0] / sigma_1).clamp(max=NARROWEST).sqrt() * along(self.modes.mT, u)
 
     def forward(self, x: Tensor, t: Tensor, ends: Tensor | None = None) -> Tensor:
         """The velocity at x (batch, T, D) and t (batch,), (batch, T, D); start and goal it takes from x."""
-        z, s = self.coordinates(x), t[:, None, None]
+        # In the memory layout of what it is combined with.
+        z, s = self.coordinates(x).contiguous(), t[:, None, None]
         sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
         a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2
         c = (self.source_variance * self.variance).sqrt() / sigma_t
-        return self.modes @ (a * z + c * self.rest(x, (z / sigma_t).clamp(-SEEN, SEEN), t))
+        return along(self.modes, a * z + c * self.rest(x, (z / sigma_t).clamp(-SEEN, SEEN), t))
 
     @abstractmethod
     def rest(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
@@ -149,9 +151,16 @@ class Spectral(Velocity, ABC):
         angles = t[:, None] * self.frequencies
         return [t[:, None], angles.sin(), angles.cos()]
 
-    def pushed(self, x: Tensor) -> Tensor:
-        """grad C in the modes, each as wide as the source is in it, (batch, m, D)."""
-        return (self.source_variance / self.source_variance[0]).sqrt() * (self.modes.mT @ self.constraint.gradient(x))
+    def pushed(self, grad_C: Tensor) -> Tensor:
+        """grad C (batch, T, D) in the modes, each as wide as the source is in it, (batch, m, D)."""
+        return (self.source_variance / self.source_variance[0]).sqrt() * along(self.modes.mT, grad_C)
+
+
+def _analysis(source: Source) -> Tensor:
+    """The matrix E^T (I - W O), float64 (m, T), with O x = x_O: of x to its coordinates z."""
+    A = source.modes.mT.clone()
+    A[:, source.index] -= source.modes.mT @ source.mean_map
+    return A
 
 
 class SpectralMLP(Spectral):
@@ -181,9 +190,9 @@ class SpectralMLP(Spectral):
         nn.init.zeros_(self.outlet.bias)
 
     def rest(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
-        pushed = self.pushed(x)
-        near = 4 * self.constraint.clearance(x).clamp(max=1)  # only the near ones matter
-        values = [z.flatten(1), x[:, self.observed].flatten(1), *self.clock(t), near, pushed.flatten(1)]
+        clearance, grad_C = self.constraint.clearance_and_gradient(x)
+        near = 4 * clearance.clamp(max=1)  # only the near ones matter
+        values = [z.flatten(1), x[:, self.observed].flatten(1), *self.clock(t), near, self.pushed(grad_C).flatten(1)]
         with self.layers(x):
             h = self.outlet(self.blocks(self.inlet(torch.cat(values, dim=1))))
         return h.to(z.dtype).view_as(z)

@@ -55,6 +55,9 @@ def descended(v: Field, push: Push, steps: int = 4, since: float = 0.3) -> Field
 
     def field(x: Tensor, t: Tensor) -> Tensor:
         u = v(x, t)
+        # An accelerator would wait for a number that is read.
+        if t.device.type == "cpu" and bool((t < since).all()):
+            return u
         e = predicted = end(x, u, t)
         for _ in range(steps):
             e = e + push(e)

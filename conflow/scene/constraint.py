@@ -8,6 +8,8 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 from typing import cast
 
 import torch
@@ -59,21 +61,21 @@ class Barrier:
     def total(self, c: Tensor) -> Tensor:
         """C of trajectories with clearances c (batch, T, n), (batch,)."""
         if self.pairs == "all":
-            return self._weight(c) * self.value(c).sum(dim=(1, 2))
-        return self._weight(c) * self.value(self._candidates(c).min(dim=2).values).sum(dim=1)
+            return self._weighted(self.value(c).sum(dim=(1, 2)), c)
+        return self._weighted(self.value(self._candidates(c).min(dim=2).values).sum(dim=1), c)
 
     def slopes(self, c: Tensor) -> Tensor:
         """dC/dc of the same, (batch, T, n)."""
-        if self.pairs == "all":
-            return self._weight(c) * self.slope(c)
         candidates = self._candidates(c)
+        if self.pairs == "all" or candidates.shape[2] == 1:
+            return self._weighted(self.slope(c), c)
         nearest = candidates.min(dim=2, keepdim=True)
-        slope = self._weight(c) * self.slope(nearest.values)
+        slope = self._weighted(self.slope(nearest.values), c)
         return torch.zeros_like(candidates).scatter(2, nearest.indices, slope).view_as(c)
 
-    def _weight(self, c: Tensor) -> float:
-        """What C at one waypoint counts for in C of the trajectory."""
-        return 1 / c.shape[1] if self.reduction == "mean" else 1
+    def _weighted(self, value: Tensor, c: Tensor) -> Tensor:
+        """A value of waypoints as it counts in C of the trajectory."""
+        return value / c.shape[1] if self.reduction == "mean" else value
 
     def _candidates(self, c: Tensor) -> Tensor:
         """Clearances arranged so that each row's smallest one counts: (batch, T, n) or (batch, 1, T n)."""
@@ -131,6 +133,11 @@ class Constraint(nn.Module, ABC):
         """grad C(x), (batch, T, D): points away from the violation."""
         c, pullback = self.vjp(x)
         return pullback(self.shape.slopes(c))
+
+    def clearance_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """c, (batch, T), and grad C(x), (batch, T, D), from the same clearances."""
+        c, pullback = self.vjp(x)
+        return c.amin(dim=2), pullback(self.shape.slopes(c))
 
     def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """C(x), (batch,), and grad C(x), (batch, T, D), from the same clearances."""
@@ -190,14 +197,18 @@ class Sum(Constraint):
         return torch.stack([term.swept_clearance(x) for term in self.terms]).amin(dim=0)
 
     def barrier(self, x: Tensor) -> Tensor:
-        return torch.stack([term.barrier(x) for term in self.terms]).sum(dim=0)
+        return reduce(add, (term.barrier(x) for term in self.terms))
 
     def gradient(self, x: Tensor) -> Tensor:
-        return torch.stack([term.gradient(x) for term in self.terms]).sum(dim=0)
+        return reduce(add, (term.gradient(x) for term in self.terms))
+
+    def clearance_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        c, g = zip(*(term.clearance_and_gradient(x) for term in self.terms), strict=True)
+        return reduce(torch.minimum, c), reduce(add, g)
 
     def barrier_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
         C, g = zip(*(term.barrier_and_gradient(x) for term in self.terms), strict=True)
-        return torch.stack(C).sum(dim=0), torch.stack(g).sum(dim=0)
+        return reduce(add, C), reduce(add, g)
 
     def shaped(self, shape: Barrier, margin: float = 0.0) -> Constraint:
         return Sum([term.shaped(shape, margin) for term in self.terms])
@@ -205,6 +216,8 @@ class Sum(Constraint):
 
 class Avoidance(Constraint):
     """Pairs of bodies that keep their distance: body points p, separations w = A p - b, clearances |w| - r.
+
+    The pairs come first in memory, so that they are taken apart and added up as whole blocks.
 
     Args:
         robots: places the body points.
@@ -228,39 +241,52 @@ class Avoidance(Constraint):
         return self.clearances(x).amin(dim=2)
 
     def clearances(self, x: Tensor) -> Tensor:
-        return self._pairs(x)[2]
+        return self._gaps(_length(self._pairs(x)))
 
     def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
-        w, d, c = self._pairs(x)
+        w = self._pairs(x)
+        d = _length(w)
 
         def pullback(g: Tensor) -> Tensor:
             # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
-            dC_dw = (g / d.clamp_min(SHARED))[..., None] * w
-            return self.robots.pullback(x, self.incidence.to(w.dtype).mT @ dC_dw)
+            dC_dw = (g.movedim(2, 0) / d)[:, None] * w
+            dC_dp = self.incidence.to(w.dtype).mT @ dC_dw.flatten(1)
+            return self.robots.pullback(x, dC_dp.view(-1, *w.shape[1:]).permute(2, 3, 0, 1))
 
-        return c, pullback
+        return self._gaps(d), pullback
 
     def swept_clearance(self, x: Tensor) -> Tensor:
         # The separation goes straight too, w(tau) = w + tau u, and is shortest at tau = -<w, u> / |u|^2.
-        w, _, c = self._pairs(x)
-        u = w.diff(dim=1)
-        w = w[:, :-1]
-        length = (u * u).sum(dim=3).clamp_min(torch.finfo(u.dtype).tiny)  # of bodies that keep their separation: 0
-        tau = (-(w * u).sum(dim=3) / length).clamp(0, 1)
-        nearest = torch.linalg.vector_norm(w + tau[..., None] * u, dim=3) - self.radius
+        w = self._pairs(x)
+        d, u, w = _length(w), w.diff(dim=3), w[..., :-1]
+        # |u| is 0 of bodies that keep their separation.
+        tau = (-(w * u).sum(dim=1) / u.square().sum(dim=1).clamp_min(torch.finfo(u.dtype).tiny)).clamp(0, 1)
         # Rounding must not put the closest approach farther away than the ends.
-        return torch.minimum(nearest, torch.minimum(c[:, :-1], c[:, 1:])).amin(dim=2)
+        nearest = torch.minimum(_length(w + tau[:, None] * u), torch.minimum(d[..., :-1], d[..., 1:]))
+        return self._gaps(nearest).amin(dim=2)
 
     def narrowed(self, margin: float) -> Constraint:
         made = Avoidance(self.robots, self.incidence, self.offset, self.touching + margin)
         made.shape = self.shape
         return made
 
-    def _pairs(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Separations w (batch, T, pairs, 2 or 3), distances d = |w| and clearances c = d - r, (batch, T, pairs)."""
-        w = torch.einsum("pn,btnk->btpk", self.incidence.to(x.dtype), self.robots.points(x)) - self.offset
-        d = torch.linalg.vector_norm(w, dim=3)
-        return w, d, d - self.radius
+    def _pairs(self, x: Tensor) -> Tensor:
+        """Separations w, (pairs, 2 or 3, batch, T)."""
+        p = self.robots.points(x).permute(2, 3, 0, 1)
+        w = (self.incidence.to(x.dtype) @ p.flatten(1)).view(-1, *p.shape[1:])
+        return w - self.offset[:, :, None, None]
+
+    def _gaps(self, d: Tensor) -> Tensor:
+        """Clearances c = d - r, (batch, T, pairs), of distances d (pairs, batch, T)."""
+        return (d - self.radius[:, None, None]).movedim(0, 2)
+
+
+def _length(w: Tensor) -> Tensor:
+    """|w| of w (pairs, 2 or 3, batch, T), (pairs, batch, T): `linalg.vector_norm` takes longer in this layout.
+
+    Of two bodies that share a point it is the root of the smallest number, so that w / |w| is 0 and no division by 0.
+    """
+    return w.square().sum(dim=1).clamp_min(torch.finfo(w.dtype).tiny).sqrt()
 
 
 class RobotAvoidance(Avoidance):

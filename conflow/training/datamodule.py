@@ -68,7 +68,7 @@ class Batches:
                 [part[torch.randint(len(part), (count,), generator=noise, device=x.device)] for part, count in parts]
             )
             self.step = step + 1
-            yield x[i], violates[i]
+            yield x.index_select(0, i), violates[i]  # whole trajectories at a time, which x[i] does not
 
     @property
     def sizes(self) -> list[int]:

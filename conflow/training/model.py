@@ -1,11 +1,11 @@
 """ConFlow as a torch module: Algorithm 1 of the paper, and sampling from what it trained. Needs torch alone."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from typing import cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from conflow.flow.correction import Correction, descend
@@ -125,10 +125,11 @@ class ConFlow(nn.Module):
 
     def distance(self, v: Tensor, u: Tensor) -> Tensor:
         """|v - u|^2 of velocities (batch, T, D), the mean over batch, waypoints and dimensions, or over modes."""
+        difference = v - u
         if self.config.train.norm == "modes":
             assert isinstance(self.v, Spectral)  # the config was checked
-            v, u = self.v.balanced(v), self.v.balanced(u)
-        return F.mse_loss(v, u)
+            difference = self.v.balanced(difference)
+        return difference.square().mean()
 
     def guided_around(self, setting: str) -> Sequence[str]:
         """The names of the constraints that a setting guides around."""
@@ -159,7 +160,7 @@ class ConFlow(nn.Module):
         """A field guided by corrections u^c with their weights lambda, in the way that `sample.guidance` says."""
 
         def push(x: Tensor) -> Tensor:
-            return torch.stack([weight * u_c(x) for u_c, weight in weighted]).sum(dim=0)
+            return reduce(add, (weight * u_c(x) for u_c, weight in weighted))
 
         return GUIDANCE[self.config.sample.guidance](v, push)
 
