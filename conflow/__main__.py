@@ -86,9 +86,8 @@ def _cluster(address: str) -> "ModuleType":
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
-        raise errors.ConfigError(
-            f"cluster={address}: found no Ray, expected the extra of it; try: {sys.executable} -m pip install '.[cluster]'"
-        ) from None
+        install = f"{sys.executable} -m pip install '.[cluster]'"
+        raise errors.ConfigError(f"cluster={address}: found no Ray, expected it; try: {install}") from None
     return cluster
 
 
