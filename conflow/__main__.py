@@ -296,6 +296,7 @@ def guarded(command: "Callable[[list[str]], None]", arguments: list[str]) -> Non
         signals.check()
         sys.stdout.flush()  # what the output says to this is said here, not after the end
     except BaseException as error:
+        signals.ending()
         sys.exit(_exit_code(error))
 
 

@@ -192,7 +192,7 @@ def check_alike(*known: Mapping[str, str]) -> None:
     own = {name: value for one in known for name, value in one.items()}
     (first, expected), *others = each((platform.node(), own))
     for number, (host, found) in enumerate(others, start=1):
-        for name in expected.keys() | found.keys():
+        for name in expected | found:
             if (one := found.get(name)) != (other := expected.get(name)):
                 raise ConfigError(
                     f"{name}: found {one} on rank {number}, {host}, expected {other} as on rank 0, {first}"

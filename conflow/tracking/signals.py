@@ -71,6 +71,11 @@ def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(dropped)
 
 
+def ending() -> None:
+    """From here on signals interrupt nothing: the process ends, and says why."""
+    _state.holding += 1
+
+
 def arrived() -> Interrupted | None:
     """What asked this process to end, if anything did, whatever became of the exception since.
 
