@@ -86,8 +86,9 @@ def _cluster(address: str) -> "ModuleType":
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
-        install = f"{sys.executable} -m pip install '.[cluster]'"
-        raise errors.ConfigError(f"cluster={address}: found no Ray, expected it; try: {install}") from None
+        raise errors.ConfigError(
+            f"cluster={address}: found no Ray, expected the extra `cluster`; try: pip install '.[cluster]'"
+        ) from None
     return cluster
 
 

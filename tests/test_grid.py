@@ -35,6 +35,17 @@ def test_a_grid_with_a_mistyped_cell_is_refused_before_any_is_started(argument: 
     assert not (tmp_path / "runs" / "mlflow.db").exists()
 
 
+def test_a_cluster_without_ray_is_refused_with_how_to_install_it(tmp_path: Path) -> None:
+    hidden = "import sys; sys.modules['ray'] = None; from conflow.__main__ import main; main()"
+    command = [sys.executable, "-c", hidden, *GRID, "cluster=auto"]
+    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert refused.returncode == 2
+    assert refused.stderr == (
+        "conflow: cluster=auto: found no Ray, expected the extra `cluster`; try: pip install '.[cluster]'\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_cells_progress_is_what_its_process_says_of_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its stages follow one another: training is 0.9 of the whole, sampling of either split half of the rest."""
     cell = Job([], config.load(), progress=tmp_path / "progress")

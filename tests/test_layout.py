@@ -80,6 +80,15 @@ def test_imports_go_downwards_only(module: str) -> None:
     assert ours <= below[part(module)]
 
 
+def test_ray_is_imported_by_the_grid_on_a_cluster_alone() -> None:
+    """It is an extra, and the one command that trains on a cluster imports what imports it, when it is asked to."""
+    assert {module for module in FILES if "ray" in {name.split(".")[0] for name in imports(module)}} == {
+        "conflow.grid.cluster"
+    }
+    assert {module for module in FILES if "conflow.grid.cluster" in imports(module)} == {"conflow.__main__"}
+    assert "conflow.grid.cluster" not in loaded("-c", "import conflow.__main__, conflow.grid.local")
+
+
 @pytest.mark.parametrize(("room", "libraries"), [("flow", {"torch"}), ("scene", {"torch", "numpy"})])
 def test_the_method_and_the_world_stand_on_torch(room: str, libraries: set[str]) -> None:
     """Beside the standard library flow/ imports torch, and scene/, which reads files, NumPy too."""
