@@ -33,7 +33,7 @@ def changed(package: Path) -> set[str]:
 
 def test_a_flipped_sign_shows_and_a_copy_does_not(package: Path) -> None:
     assert changed(package) == set()
-    edit(package / CORRECTION, "return (self", "return -(self")
+    edit(package / CORRECTION, "return along(self", "return -along(self")
     assert changed(package) == {CORRECTION}
 
 

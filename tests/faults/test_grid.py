@@ -66,8 +66,8 @@ def test_changed_code_is_trained_anew_and_a_changed_comment_is_not(tmp_path: Pat
         shutil.copytree(root / part, tmp_path / part)
     correction = tmp_path / "conflow" / "flow" / "correction.py"
     text = correction.read_text()
-    assert text.count("return (self") == 1
-    flipped = text.replace("return (self", "return -(self")
+    assert text.count("return along(self") == 1
+    flipped = text.replace("return along(self", "return -along(self")
     expected = {
         text: ["1 cells, 0 of them finished before"],
         f"# A comment.\n{text}": ["1 cells, 1 of them finished before"],
