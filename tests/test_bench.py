@@ -186,6 +186,7 @@ def test_the_rest_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
         "source",
         "250 Euler steps",
         "plus: 20 evaluations",
+        "planner.plan",
         "conflow --help",
     }
 
