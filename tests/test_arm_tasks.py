@@ -1,5 +1,6 @@
 """Two arms that swap sides: their demonstrations, and plans in radians and metres."""
 
+import io
 import math
 from functools import cache
 
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from conflow.errors import ConfigError
+from conflow.figures.plans import picture
 from conflow.planner import PlanError, Planner
 from conflow.scene.arm_constraints import FAR, SphereAvoidance
 from conflow.scene.measures import leaves_workspace
@@ -137,3 +139,18 @@ def test_a_run_of_arms_is_loaded_with_its_scales(tmp_path: object) -> None:
     assert (loaded.length, loaded.origin) == (1.0, (0.0, 0.0))
     assert Planner.load(path).scale[0] == pytest.approx(2.8973)
     assert math.isclose(loaded.dt, 4 / 31)
+
+
+@tasks
+def test_plans_of_arms_are_drawn_with_their_bodies(name: str) -> None:
+    """From the front and from above, in the plane from above: every body at five moments, and the obstacle given."""
+    flow, (task, x) = planner(name), made(name)
+    start, goal = task.robots.joints(x[0, [0, -1]])
+    place = (0.0, 0.0, 1.1, 0.05) if task.robots.axes == 3 else (0.0, 1.5, 0.05)
+    figure = picture(flow, flow.plan(start, goal, 3, obstacles=[place]), [place])
+    assert [axis.get_title() for axis in figure.axes] == (["front", "top"] if task.robots.axes == 3 else ["top"])
+    for axis in figure.axes:
+        assert sum(len(drawn.get_paths()) for drawn in axis.collections) == 5 * len(task.robots.owner)
+        assert len(axis.patches) == 1
+        assert len(axis.lines) == 2 * 3 + 2  # both hands' ways in three plans, and the best in bold
+    figure.savefig(io.BytesIO())

@@ -29,6 +29,7 @@ def animation(model: ConFlow, evaluation: Evaluation, name: str) -> str:
         "name": name,
         "obstacles": model.task.obstacles(),
         "owner": model.task.robots.owner.tolist(),
+        "traced": [*model.task.robots.traced],
         "colours": {"robots": ROBOTS, "collision": COLLISION, "obstacle": OBSTACLE},
         "scenes": [
             {

@@ -7,8 +7,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from conflow.figures.arms import motion
 from conflow.figures.workspace import COLLISION, NAMED, OBSTACLE, ROBOTS, rounded, seen_from_above, standing
 from conflow.planner import Planner, Plans
+from conflow.scene.arms import Arms
 from conflow.scene.settings import Box
 
 PER_ROW = 3
@@ -18,13 +20,17 @@ PER_ROW = 3
 def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]] = ()) -> Figure:
     """The plans of one pair, each robot's in its colour, infeasible ones in another, and the best plan in bold.
 
-    Of many robots the best plan alone, whose lines are enough to see.
+    Of many robots the best plan alone, whose lines are enough to see; of arms its bodies, and the ways of all hands.
 
     Args:
         planner: whose plans they are.
         plans: in the user's units.
         obstacles: discs (x, y, radius) in the same, beside those that the task always has.
     """
+    title = f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible"
+    if isinstance(planner.model.task.robots, Arms):
+        x = planner.to_workspace(plans.x)
+        return motion(planner.model.task.robots, x, plans.feasible, obstacles, title)
     figure = Figure(figsize=(4.6, 5.4), layout="constrained")
     axis = figure.add_subplot(aspect="equal")
     task, reach = planner.model.task, 1.05 * planner.length
@@ -34,7 +40,7 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
     axis.spines[["top", "right"]].set_visible(False)
     crowd = task.robots.count > NAMED
     best = "\nthe best one is drawn" if crowd else ""
-    axis.set_title(f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible{best}")
+    axis.set_title(f"{title}{best}")
     paths = planner.length * seen_from_above(task.robots, planner.to_workspace(plans.x)) + origin
     for body, robot in enumerate(task.robots.owner.tolist()):
         colour = ROBOTS[robot % len(ROBOTS)]

@@ -204,8 +204,8 @@ def _trajectories(axis: Axes, x: Tensor, violates: Tensor, constraint: Constrain
         return
     x, violates = x[: shown(robots)], violates[: shown(robots)]
     paths = seen_from_above(robots, x)
-    for body, robot in enumerate(robots.owner.tolist()):
-        colour = ROBOTS[robot % len(ROBOTS)]
+    for body in robots.traced:
+        colour = ROBOTS[int(robots.owner[body]) % len(ROBOTS)]
         axis.add_collection(LineCollection(list(paths[~violates, :, body].numpy()), colors=colour, alpha=0.4, lw=0.9))
         axis.add_collection(LineCollection(list(paths[violates, :, body].numpy()), colors=COLLISION, alpha=0.9, lw=0.9))
         starts = paths[:, 0, body]

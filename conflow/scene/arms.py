@@ -125,6 +125,10 @@ class Arms(Robots):
     def __deepcopy__(self, memo: dict[int, object]) -> "Arms":
         return self  # nothing that counts ever changes
 
+    @property
+    def traced(self) -> Sequence[int]:
+        return [int((self.owner == arm).nonzero()[-1]) for arm in range(len(self.chains))]
+
     def joints(self, x: Tensor) -> Tensor:
         """The joints q in radians, (..., D), of configurations x."""
         return self.scale.to(x) * x + self.offset.to(x)

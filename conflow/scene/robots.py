@@ -27,6 +27,11 @@ class Robots(ABC):
         """How many robots there are."""
         return int(self.owner.max()) + 1
 
+    @property
+    def traced(self) -> Sequence[int]:
+        """The bodies whose paths pictures draw: here all."""
+        return range(len(self.owner))
+
     @abstractmethod
     def points(self, x: Tensor) -> Tensor:
         """The bodies' centres, (batch, T, bodies, 2 or 3), of configurations x (batch, T, D)."""
