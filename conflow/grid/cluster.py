@@ -193,6 +193,16 @@ def _place(address: str, cpus: int, gpus: int) -> Place:
         proof.unlink()
     _check_alike(address, nodes)
     shared = all(node.reads == proof.name for node in nodes)
+    _check_store(address, nodes, shared)
+    return Place(Path.cwd(), shared, variables, cpus, gpus)
+
+
+def _check_store(address: str, nodes: Sequence[Node], shared: bool) -> None:
+    """Refuse several hosts, or folders of their own, without a server, and a server that one of them does not reach.
+
+    Raises:
+        ConfigError: which nodes.
+    """
     hosts = sorted({node.host for node in nodes})
     if not store.store_uri().startswith("http") and (len(hosts) > 1 or not shared):
         raise ConfigError(
@@ -202,7 +212,6 @@ def _place(address: str, cpus: int, gpus: int) -> Place:
     for node in nodes:
         if node.unreachable:
             raise ConfigError(f"cluster={address}: node {node.host}: {node.unreachable}")
-    return Place(Path.cwd(), shared, variables, cpus, gpus)
 
 
 def _look_at_all(address: str, proof: Path, variables: dict[str, str]) -> list[Node]:
