@@ -114,7 +114,8 @@ def test_softplus_stays_below_relu_and_approaches_it(reduction: Reduction, gamma
     gap = relu - softplus
     assert bool((gap >= 0).all())
     assert bool((gap <= counted * math.log(2) / gamma + 1e-14).all())  # float64 rounding
-    assert float(gap.max()) > 0
+    if gamma < 1e6:  # there hardly a waypoint is near enough to the threshold for a bit of difference
+        assert float(gap.max()) > 0
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -8,6 +8,7 @@ from matplotlib import colormaps
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
 from conflow.figures.workspace import DPI, rounded
@@ -30,6 +31,9 @@ def success(task: str, robots: int, methods: Mapping[str, Attempts], path: Path)
         share = [k / len(seconds) for k in range(1, len(solved) + 1)]
         ends = [*solved, latest], [*share, share[-1] if share else 0.0]
         axis.step(*ends, where="post", color=COLOURS[i % len(COLOURS)], label=name, lw=1.8)
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.xaxis.set_minor_locator(NullLocator())
     axis.set_title(f"{task}, {robots} robots, {len(next(iter(methods.values()))[0])} scenes")
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, loc="best", fontsize=9)
