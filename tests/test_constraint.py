@@ -329,3 +329,12 @@ def test_a_swept_clearance_that_is_not_a_number_stays_so() -> None:
     x = apart(1.0, 1.0, 1.0)
     x[0, 2] = math.nan
     assert keep_apart(2, 0.25).swept_clearance(x)[0].isnan().tolist() == [False, True]
+
+
+def test_no_trajectories_have_no_clearances() -> None:
+    """Such as the negatives of demonstrations that are all feasible."""
+    constraint = keep_apart(2)
+    x = trajectories()[:0]
+    assert constraint.clearance(x).shape == constraint.swept_clearance(x).shape[:1] + x.shape[1:2]
+    assert constraint.gradient(x).shape == x.shape
+    assert constraint.violation(x).shape == (0,)

@@ -14,4 +14,4 @@ def along(A: Tensor, x: Tensor) -> Tensor:
     >>> along(torch.eye(32), x).equal(x)
     True
     """
-    return (x.mT.reshape(-1, x.shape[1]) @ A.mT).view(len(x), x.shape[2], -1).mT
+    return (x.mT.reshape(len(x) * x.shape[2], x.shape[1]) @ A.mT).view(len(x), x.shape[2], len(A)).mT

@@ -251,7 +251,7 @@ class Avoidance(Constraint):
             # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
             dC_dw = (g.movedim(2, 0) / d)[:, None] * w
             dC_dp = self.incidence.to(w.dtype).mT @ dC_dw.flatten(1)
-            return self.robots.pullback(x, dC_dp.view(-1, *w.shape[1:]).permute(2, 3, 0, 1))
+            return self.robots.pullback(x, dC_dp.view(self.incidence.shape[1], *w.shape[1:]).permute(2, 3, 0, 1))
 
         return self._gaps(d), pullback
 
@@ -273,7 +273,7 @@ class Avoidance(Constraint):
     def _pairs(self, x: Tensor) -> Tensor:
         """Separations w, (pairs, 2 or 3, batch, T)."""
         p = self.robots.points(x).permute(2, 3, 0, 1)
-        w = (self.incidence.to(x.dtype) @ p.flatten(1)).view(-1, *p.shape[1:])
+        w = (self.incidence.to(x.dtype) @ p.flatten(1)).view(len(self.incidence), *p.shape[1:])
         return w - self.offset[:, :, None, None]
 
     def _gaps(self, d: Tensor) -> Tensor:
