@@ -2,7 +2,10 @@
 
 import io
 import math
+import re
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -124,6 +127,19 @@ def test_a_planner_is_given_spheres_in_metres() -> None:
         flow.plan(start, goal, 3, obstacles=[(*hand, 0.05)])
     with pytest.raises(PlanError, match=r"^obstacles for arms in 3 dimensions: expected as many numbers of a place$"):
         flow.plan(start, goal, 3, obstacles=[(0.0, 0.0, 0.1)])
+
+
+def test_the_readme_s_lines_plan_for_two_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With whatever model: this one was not trained."""
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    (lines,) = re.findall(r"planner = Planner.load\(.pandas.*?(?=```)", text, re.DOTALL)
+    flow = planner("pandas")
+    monkeypatch.setattr(Planner, "load", classmethod(lambda cls, run: flow))
+    known: dict[str, Any] = {"pi": math.pi, "Planner": Planner}
+    exec(lines, known)
+    plans = known["plans"]
+    assert plans.x.shape == (64, 32, 14)
+    assert plans.x[0, 0].tolist() == pytest.approx([-0.8, *known["rest"]] * 2)
 
 
 def test_a_run_of_arms_is_loaded_with_its_scales(tmp_path: object) -> None:

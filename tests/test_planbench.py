@@ -199,19 +199,21 @@ def test_what_is_published_stands_apart_with_its_hardware(record: Record) -> Non
 
 def test_a_model_meets_maps_and_radii_that_it_was_not_trained_on(model: ConFlow) -> None:
     settings = Settings(num=2, limit=20.0, looked=1)
-    for task in ("basic", "scaled_weave"):
+    for task, robots in (("basic", 6), ("scaled_weave", 32)):
         named = config.load([f"task={task}", "ablation=plus"])
-        made = planbench.crowd(named, 6)
-        scene, ends = made.in_scene(6, 0, 0), made.scene(6, 0, 0)
+        made = planbench.crowd(named, robots)
+        scene, ends = made.in_scene(robots, 0, 0), made.scene(robots, 0, 0)
         ours = planbench.of_model("ours", model, named, settings)
         x, _ = ours.solve(scene, ends, 0)
         assert x is not None
         assert bool(planbench.feasible(scene, x[None], ends[None]).all())
         assert ours.propose is not None
-        # On a map of its own another network's features are in play, with the same weights.
         there = ours.propose(scene, ends, 2, 0)
         assert torch.equal(there, ours.propose(scene, ends, 2, 0))
         assert torch.equal(there[:, [0, -1]], ends.expand(2, -1, -1))
+        # What it meets there moves what the same network makes of the same noise.
+        elsewhere = CROWDS["weave"](robots)
+        assert not torch.equal(there, ours.propose(elsewhere, ends, 2, 0))
 
 
 def test_the_benchmark_is_of_crowds_that_find_room(model: ConFlow) -> None:
@@ -268,7 +270,7 @@ def test_a_map_is_drawn_where_trajectories_are(tmp_path: Path) -> None:
 def test_the_readme_s_lines_plan_for_28_robots(model: ConFlow, monkeypatch: pytest.MonkeyPatch) -> None:
     """With whatever model: this one was not trained."""
     text = (Path(__file__).parents[1] / "README.md").read_text()
-    (lines,) = re.findall(r"```python\n(from conflow import Planner\n.*?)```", text, re.DOTALL)
+    (lines,) = re.findall(r"```python\n(from math .*?)planner = Planner.load\(.pandas", text, re.DOTALL)
     assert len(lines.splitlines()) <= 10
     monkeypatch.setattr(Planner, "load", classmethod(lambda cls, run: cls(model)))
     known: dict[str, Any] = {}
