@@ -214,10 +214,54 @@ class Sum(Constraint):
         return Sum([term.shaped(shape, margin) for term in self.terms])
 
 
-class Avoidance(Constraint):
-    """Pairs of bodies that keep their distance: body points p, separations w = A p - b, clearances |w| - r.
+class PairAvoidance(Constraint):
+    """Pairs of bodies that keep their distance: separations w, clearances |w| - r.
 
     The pairs come first in memory, so that they are taken apart and added up as whole blocks.
+    """
+
+    @abstractmethod
+    def separations(self, x: Tensor) -> Tensor:
+        """w, (pairs, 2 or 3, batch, T)."""
+
+    @abstractmethod
+    def onto_bodies(self, dC_dw: Tensor) -> Tensor:
+        """The gradient with respect to the bodies' centres, (bodies, 2 or 3, batch, T), of one with respect to w."""
+
+    @abstractmethod
+    def gaps(self, d: Tensor) -> Tensor:
+        """Clearances d - r of distances d, both (pairs, batch, T)."""
+
+    def clearance(self, x: Tensor) -> Tensor:
+        return self.clearances(x).amin(dim=2)
+
+    def clearances(self, x: Tensor) -> Tensor:
+        return self.gaps(_length(self.separations(x))).movedim(0, 2)
+
+    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
+        w = self.separations(x)
+        d = _length(w)
+
+        def pullback(g: Tensor) -> Tensor:
+            # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
+            dC_dw = (g.movedim(2, 0) / d)[:, None] * w
+            return self.robots.pullback(x, self.onto_bodies(dC_dw).permute(2, 3, 0, 1))
+
+        return self.gaps(d).movedim(0, 2), pullback
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        # The separation goes straight too, w(tau) = w + tau u, and is shortest at tau = -<w, u> / |u|^2.
+        w = self.separations(x)
+        d, u, w = _length(w), w.diff(dim=3), w[..., :-1]
+        # |u| is 0 of bodies that keep their separation.
+        tau = (-(w * u).sum(dim=1) / u.square().sum(dim=1).clamp_min(torch.finfo(u.dtype).tiny)).clamp(0, 1)
+        # Rounding must not put the closest approach farther away than the ends.
+        nearest = torch.minimum(_length(w + tau[:, None] * u), torch.minimum(d[..., :-1], d[..., 1:]))
+        return self.gaps(nearest).amin(dim=0)
+
+
+class Avoidance(PairAvoidance):
+    """Given pairs: body points p, separations w = A p - b.
 
     Args:
         robots: places the body points.
@@ -237,48 +281,22 @@ class Avoidance(Constraint):
         self.register_buffer("offset", offset, persistent=False)
         self.register_buffer("radius", radius.to(torch.get_default_dtype()), persistent=False)
 
-    def clearance(self, x: Tensor) -> Tensor:
-        return self.clearances(x).amin(dim=2)
+    def separations(self, x: Tensor) -> Tensor:
+        p = self.robots.points(x).permute(2, 3, 0, 1)
+        w = (self.incidence.to(x.dtype) @ p.flatten(1)).view(len(self.incidence), *p.shape[1:])
+        return w - self.offset[:, :, None, None]
 
-    def clearances(self, x: Tensor) -> Tensor:
-        return self._gaps(_length(self._pairs(x)))
+    def onto_bodies(self, dC_dw: Tensor) -> Tensor:
+        A = self.incidence.to(dC_dw.dtype)
+        return (A.mT @ dC_dw.flatten(1)).view(A.shape[1], *dC_dw.shape[1:])
 
-    def vjp(self, x: Tensor) -> tuple[Tensor, Pullback]:
-        w = self._pairs(x)
-        d = _length(w)
-
-        def pullback(g: Tensor) -> Tensor:
-            # d|w|/dw = w / |w|; where two bodies share a point there is none, and this is the subgradient 0.
-            dC_dw = (g.movedim(2, 0) / d)[:, None] * w
-            dC_dp = self.incidence.to(w.dtype).mT @ dC_dw.flatten(1)
-            return self.robots.pullback(x, dC_dp.view(self.incidence.shape[1], *w.shape[1:]).permute(2, 3, 0, 1))
-
-        return self._gaps(d), pullback
-
-    def swept_clearance(self, x: Tensor) -> Tensor:
-        # The separation goes straight too, w(tau) = w + tau u, and is shortest at tau = -<w, u> / |u|^2.
-        w = self._pairs(x)
-        d, u, w = _length(w), w.diff(dim=3), w[..., :-1]
-        # |u| is 0 of bodies that keep their separation.
-        tau = (-(w * u).sum(dim=1) / u.square().sum(dim=1).clamp_min(torch.finfo(u.dtype).tiny)).clamp(0, 1)
-        # Rounding must not put the closest approach farther away than the ends.
-        nearest = torch.minimum(_length(w + tau[:, None] * u), torch.minimum(d[..., :-1], d[..., 1:]))
-        return self._gaps(nearest).amin(dim=2)
+    def gaps(self, d: Tensor) -> Tensor:
+        return d - self.radius[:, None, None]
 
     def narrowed(self, margin: float) -> Constraint:
         made = Avoidance(self.robots, self.incidence, self.offset, self.touching + margin)
         made.shape = self.shape
         return made
-
-    def _pairs(self, x: Tensor) -> Tensor:
-        """Separations w, (pairs, 2 or 3, batch, T)."""
-        p = self.robots.points(x).permute(2, 3, 0, 1)
-        w = (self.incidence.to(x.dtype) @ p.flatten(1)).view(len(self.incidence), *p.shape[1:])
-        return w - self.offset[:, :, None, None]
-
-    def _gaps(self, d: Tensor) -> Tensor:
-        """Clearances c = d - r, (batch, T, pairs), of distances d (pairs, batch, T)."""
-        return (d - self.radius[:, None, None]).movedim(0, 2)
 
 
 def _length(w: Tensor) -> Tensor:
