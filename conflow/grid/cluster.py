@@ -13,7 +13,6 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +28,11 @@ from conflow.errors import ConfigError
 from conflow.grid import local
 from conflow.grid.local import Job
 from conflow.scene.errors import DemonstrationError
-from conflow.tracking import carried, code, liveness, signals, store
+from conflow.tracking import carried, code, liveness, recording, signals, store
 from conflow.training import config, progress
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.progress import ProgressDisplay
 
-LIBRARIES = ("torch", "numpy", "scipy", "lightning", "torchmetrics", "mlflow", "omegaconf")
-"""Whose versions decide numbers, or what is stored of them."""
 OUTPUT = Path("runs", "output")
 """What cells print, a file each."""
 
@@ -73,7 +70,7 @@ class Node:
     Attributes:
         host: its name.
         code: the digests of its files that decide numbers.
-        versions: of Python and libraries.
+        versions: of this program, Python and libraries.
         reads: what it reads where the grid wrote something.
         unreachable: why it cannot use the store, if so.
     """
@@ -246,18 +243,7 @@ def _look(proof: Path, variables: dict[str, str]) -> Node:
     except ConfigError as error:
         unreachable = str(error)
     reads = proof.read_text() if proof.exists() else ""
-    return Node(platform.node(), dict(code.files()), versions(), reads, unreachable)
-
-
-def versions() -> dict[str, str]:
-    """Of Python and of the libraries."""
-    found = {"python": platform.python_version()}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
+    return Node(platform.node(), dict(code.files()), recording.versions(), reads, unreachable)
 
 
 def _check_alike(address: str, nodes: Sequence[Node]) -> None:
@@ -266,7 +252,7 @@ def _check_alike(address: str, nodes: Sequence[Node]) -> None:
     Raises:
         ConfigError: which node, and in what it differs.
     """
-    ours, files = versions(), code.files()
+    ours, files = recording.versions(), code.files()
     for node in nodes:
         other = [f"{name} {found}" for name, found in node.versions.items() if found != ours.get(name)]
         expected = [f"{name} {ours[name]}" for name, found in node.versions.items() if found != ours.get(name)]
@@ -406,9 +392,7 @@ def _elsewhere(cell: Job, any_code: bool) -> str:
 
 def _environment(place: Place) -> dict[str, str]:
     """The variables of a cell's process."""
-    # Lightning would take a cell of a SLURM job for the job's only training, and load what another left.
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith("SLURM_")}
     paths = [str(Path(conflow.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     own = {"OMP_NUM_THREADS": str(place.cpus), "PYTHONPATH": os.pathsep.join(paths)}
     own |= {} if place.gpus else {"CUDA_VISIBLE_DEVICES": ""}  # of which Ray hides none from a task without
-    return inherited | own | ({} if place.shared else {carried.ASKED: "1"})
+    return {**os.environ, **own} | ({} if place.shared else {carried.ASKED: "1"})

@@ -31,6 +31,8 @@ from conflow.tracking.store import EXPERIMENT, RUNS, checkpoints, client, store_
 
 CONFIG_FILE = "config.yaml"
 FLUSH_SECONDS = 5.0
+LIBRARIES = ("torch", "numpy", "scipy", "lightning", "torchmetrics", "mlflow", "omegaconf")
+"""Whose versions decide numbers, or what is stored of them."""
 
 
 @dataclass(frozen=True)
@@ -257,8 +259,9 @@ def origin() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Of this program and of the libraries that decide what a run is like."""
-    return {"conflow": __version__} | {name: version(name) for name in ("torch", "lightning", "mlflow")}
+    """Of this program, of Python, and of the libraries that decide what a run is like."""
+    ours = {"conflow": __version__, "python": platform.python_version()}
+    return ours | {name: version(name) for name in LIBRARIES}
 
 
 def hardware() -> str:

@@ -148,9 +148,9 @@ def test_a_grid_that_is_interrupted_and_whose_driver_is_killed_goes_on_by_the_sa
 
 def test_a_node_with_other_code_or_libraries_is_refused_by_name() -> None:
     from conflow.grid import cluster
-    from conflow.tracking import code
+    from conflow.tracking import code, recording
 
-    files, versions = dict(code.files()), cluster.versions()
+    files, versions = dict(code.files()), recording.versions()
     same = cluster.Node("alpha", files, versions, "", "")
     cluster._check_alike("auto", [same])
     changed = cluster.Node("beta", files | {"flow/path.py": "00000000"}, versions, "", "")
