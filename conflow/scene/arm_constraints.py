@@ -208,7 +208,6 @@ class SelfAvoidance(NearestPair):
 
     def __init__(self, robots: Arms, arm: int) -> None:
         own = [one for one in _bodies(robots) if one[0] == arm]
-
         super().__init__(robots, own, _separate, FAR_FROM_ITSELF)
 
 

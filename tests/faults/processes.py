@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,16 @@ def runs(folder: Path) -> list[Run]:
     experiment = client.get_experiment_by_name("conflow")
     assert experiment is not None
     return list(client.search_runs([experiment.experiment_id], order_by=["attributes.start_time DESC"]))
+
+
+def wait_for_metrics(folder: Path, name: str) -> None:
+    """Until a run has written what it measured of a step."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if any(run.info.run_name == name and "train/loss" in run.data.metrics for run in runs(folder)):
+            return
+        time.sleep(0.3)
+    raise TimeoutError(f"{name}: {(folder / 'output').read_text() if (folder / 'output').exists() else ''}")
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:

@@ -18,7 +18,7 @@ from mlflow.entities import Run
 
 from conflow.scene.tasks.swap import swap
 from tests.faults import processes
-from tests.faults.processes import Death, history, killed_in, runs, store, weights
+from tests.faults.processes import Death, history, killed_in, runs, store, wait_for_metrics, weights
 
 TRAIN = (
     *("train", "preset=smoke", "data.num=200", "train.max_steps=41", "train.val_every=10", "train.log_every=7"),
@@ -238,15 +238,6 @@ def test_a_signal_to_all_ends_all_and_the_run_is_killed(folder: Path, whole: Run
     assert first.output.splitlines()[-1] == "conflow: interrupted by SIGTERM"
     assert second.said == []
     assert runs(folder)[0].info.status == "KILLED"
-
-
-def wait_for_metrics(folder: Path, name: str) -> None:
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        if any(run.info.run_name == name and "train/loss" in run.data.metrics for run in runs(folder)):
-            return
-        time.sleep(0.3)
-    raise TimeoutError(name)
 
 
 def test_what_cannot_be_shared_or_differs_is_refused_in_one_line_by_the_first_one(folder: Path, whole: Run) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from conflow.tracking import liveness
 from tests.faults import processes
-from tests.faults.processes import killed_in, runs, store
+from tests.faults.processes import killed_in, runs, store, wait_for_metrics
 
 SHORT = ("train", "preset=smoke", "data.num=200", "train.max_steps=1", "sample.num=8", "sample.steps=1", "seed=99")
 # Nothing but a signal ends this within the test.
@@ -36,15 +36,6 @@ def test_a_process_that_dies_while_it_makes_the_store_leaves_none_that_is_half_m
 
 def status(folder: Path, name: str) -> str:
     return next((str(run.info.status) for run in runs(folder) if run.info.run_name == name), "none")
-
-
-def wait_for_metrics(folder: Path, name: str) -> None:
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        if any(run.info.run_name == name and "train/loss" in run.data.metrics for run in runs(folder)):
-            return
-        time.sleep(0.3)
-    raise TimeoutError((folder / "output").read_text())
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -21,7 +21,7 @@ class Pandas(ArmTask):
     """Joint 1 of both sweeps from -45 to 45 degrees, so that straight ways always collide, and both lift their hands.
 
     A lift h, uniform in [-0.1, `lift`], is taken from joint 2, and 0.3 to 1 times as much from joint 4; joint 1
-    deviates by up to 0.25, joint 6 by 0.2. Straight lines always collide.
+    deviates by up to 0.25, joint 6 by 0.2.
 
     Args:
         lift: the highest, in radians.
