@@ -30,7 +30,7 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
     longer = (*GRID, "train.max_steps=2000", "train.val_every=1000")
     stopped = processes.start(tmp_path, *longer)
     deadline = time.monotonic() + 180
-    # The grid has made the store when it says this; to look at it earlier would race with its migration.
+    # Then its first cell makes the store.
     output = tmp_path / "output"
     while not (output.exists() and "2 cells, 0 of them" in output.read_text()) and time.monotonic() < deadline:
         time.sleep(0.3)
