@@ -27,7 +27,7 @@ OUT      ?=
 NUM      ?=
 PORT     ?= 5000
 # Of `make planbench`.
-N        ?= 28
+N        ?=
 SCENES   ?= 64
 ARGS     ?=
 
@@ -81,7 +81,7 @@ explain: .venv/installed  ## Draw why the covariant correction works, and what f
 demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FILE": TASK=passing, or FROM=tracks.csv; OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations $(if $(FROM),from="$(FROM)",task=$(TASK)) $(WRITTEN) seed=$(SEED) $(ARGS)
 
-planbench: .venv/installed  ## Solve scenes of many robots: TASK=weave N=28 SCENES=64 RUN=NAME,NAME or none, FORMAT= REFERENCE=1 (published)
+planbench: .venv/installed  ## Solve scenes of robots or arms: TASK=weave N=28 SCENES=64 RUN=NAME,NAME or none, FORMAT= REFERENCE=1 (published)
 	@$(CONFLOW) planbench task=$(if $(filter-out swap,$(TASK)),$(TASK),weave) n=$(N) scenes=$(SCENES) format=$(FORMAT) \
 	$(if $(REFERENCE),reference=1) $(if $(filter-out latest,$(RUN)),run=$(RUN)) $(ARGS)
 

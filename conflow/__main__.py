@@ -226,12 +226,12 @@ def demonstrations(arguments: list[str]) -> None:
 
 
 def planbench(arguments: list[str]) -> None:
-    """Solve scenes of many robots with models and without: task=weave n=28 scenes=64 run=NAME,NAME seed=1 num=16."""
+    """Solve scenes of robots or arms with models and without: task=weave n=28 scenes=64 run=NAME,NAME seed=1 num=16."""
     from conflow import commandline
     from conflow.tracking import signals
 
     signals.raise_on_signals()
-    defaults = {"task": "weave", "n": "28", "scenes": "64", "run": "", "seed": "1", "num": "16", "limit": "5"}
+    defaults = {"task": "weave", "n": "", "scenes": "64", "run": "", "seed": "1", "num": "16", "limit": "5"}
     defaults |= {"guided": "0", "format": "table", "reference": "0", "out": "runs/planbench"}
     options, settings = commandline.options(arguments, defaults)
     options["run"] = options["run"] or f"{options['task']}-plus-s0"

@@ -1,4 +1,4 @@
-"""`make planbench`: scene by scene, how soon is there one plan for many robots, and what does a model add to descent?
+"""`make planbench`: scene by scene, how soon is there one plan for all robots, and what does a model add to descent?
 
 Candidates, so many at a time, descend on what is to be kept until one of them is feasible. With a model and without,
 methods differ in where candidates come from, and in nothing else. All run on the same scenes, in the same process.
@@ -28,6 +28,7 @@ from conflow.results.printing import checked_format
 from conflow.scene.crowd import CrowdAvoidance
 from conflow.scene.measures import leaves_workspace, path_length, smoothness
 from conflow.scene.settings import Box
+from conflow.scene.task import SceneTask
 from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import CrowdTask
 from conflow.tracking import store
@@ -52,9 +53,9 @@ CORNER = 4
 AT_MOST = 2000
 """Single robots' trajectories that the energy distance is taken of."""
 
-Propose = Callable[[CrowdTask, Tensor, int, int], Tensor]
+Propose = Callable[[SceneTask, Tensor, int, int], Tensor]
 """Candidates (num, T, D) for the task in a scene, start and goal (2, D), how many, and a seed."""
-Solve = Callable[[CrowdTask, Tensor, int], tuple[Tensor | None, float]]
+Solve = Callable[[SceneTask, Tensor, int], tuple[Tensor | None, float]]
 """A feasible plan (T, D), or None, and the seconds it took, for the task in a scene, start and goal, and a seed."""
 
 
@@ -83,7 +84,7 @@ def of_model(name: str, model: ConFlow, config: Config, settings: Settings) -> M
     on = lru_cache(maxsize=1)(model.on)
 
     def proposed(guided: bool) -> Propose:
-        def propose(task: CrowdTask, ends: Tensor, num: int, seed: int) -> Tensor:
+        def propose(task: SceneTask, ends: Tensor, num: int, seed: int) -> Tensor:
             here, y = on(task), ends.expand(num, -1, -1)
             x_0 = here.source.sample(y, random_stream("planbench", seed))
             setting = next(iter(task.settings())) if guided else NONE
@@ -96,20 +97,20 @@ def of_model(name: str, model: ConFlow, config: Config, settings: Settings) -> M
 
 
 def without_model(config: Config, settings: Settings) -> Method:
-    """Candidates that are demonstrations of single robots, put together: descent does all the work."""
+    """Candidates that are new demonstrations, of single robots and put together: descent does all the work."""
 
-    def propose(task: CrowdTask, ends: Tensor, num: int, seed: int) -> Tensor:
-        return task.singles(ends.expand(num, -1, -1), random_stream("planbench", seed))
+    def propose(task: SceneTask, ends: Tensor, num: int, seed: int) -> Tensor:
+        return task.between(ends.expand(num, -1, -1), random_stream("planbench", seed))
 
     return Method("descent, no model", descending_from(propose, config, settings), propose, propose)
 
 
 def descending_from(propose: Propose, config: Config, settings: Settings) -> Solve:
     """Candidates descend until one of them is feasible; after a while others are drawn."""
-    source = build_source(config.source, CrowdTask.T)
+    source = build_source(config.source, build_task(config).T)
 
     @torch.no_grad()
-    def solve(task: CrowdTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
+    def solve(task: SceneTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
         began = time.perf_counter()
         u_c = descending(config, task, source)
         for x in looks(lambda draw: propose(task, scene, settings.num, seed + draw), u_c):
@@ -158,7 +159,8 @@ def orca(settings: Settings) -> Method:
                 return torch.from_numpy(np.stack(path)).flatten(1).float()
         return None
 
-    def solve(task: CrowdTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
+    def solve(task: SceneTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
+        assert isinstance(task, CrowdTask)
         began, draw = time.perf_counter(), np.random.default_rng(seed)
         while True:
             x = walk(task, scene, draw)
@@ -205,17 +207,18 @@ def run(
         display: for progress.
 
     Raises:
-        ConfigError: the task is none of a crowd, or the robots find no room.
+        ConfigError: the task has no scenes of so many robots, or they find no room.
     """
-    task = crowd(config, robots)
+    task = with_scenes(config, robots)
     try:
         asked = [(task.in_scene(robots, seed, i), task.scene(robots, seed, i)) for i in range(scenes)]
     except ValueError as error:
         raise ConfigError(f"task {config.task}: {error}") from None
     methods = [without_model(config, settings)]
     methods += [of_model(name, model, config, settings) for name, model in models.items()]
-    with suppress(ModuleNotFoundError):  # named as missing where the table is printed
-        methods.append(orca(settings))
+    if isinstance(task, CrowdTask):
+        with suppress(ModuleNotFoundError):  # named as missing where the table is printed
+            methods.append(orca(settings))
     rows, plans = [Row(method.name) for method in methods], [list[Tensor]() for _ in methods]
     bar = display.add(f"{config.task} {robots}", scenes)
     for index, (made, scene) in enumerate(asked):
@@ -229,9 +232,9 @@ def run(
     # Of other scenes, so that nothing of theirs is in the plans.
     others = [(task.in_scene(robots, seed + 1, i), task.scene(robots, seed + 1, i)) for i in range(scenes)]
     singles = [
-        made.singles(scene[None], random_stream("planbench law", seed, i)) for i, (made, scene) in enumerate(others)
+        made.between(scene[None], random_stream("planbench law", seed, i)) for i, (made, scene) in enumerate(others)
     ]
-    law = _by_robot(torch.cat(singles))[:AT_MOST]
+    law = _by_robot(torch.cat(singles), robots)[:AT_MOST]
     for method, row, found in zip(methods, rows, plans, strict=True):
         _look(row, method, asked[: settings.looked], settings.num)
         _measure(row, task, found, law)
@@ -240,33 +243,33 @@ def run(
     return Record(config.task, robots, seed, asdict(settings), hardware(), rows, rounded)
 
 
-def crowd(config: Config, robots: int) -> CrowdTask:
+def with_scenes(config: Config, robots: int) -> SceneTask:
     """The task that the config names, with so many robots.
 
     Raises:
-        ConfigError: it is not one of many robots.
+        ConfigError: it has no scenes.
     """
     task = build_task(config)
     made = task.of_numbers(2 * robots)
-    if not isinstance(made, CrowdTask):
-        raise ConfigError(f"task={config.task}: expected a task of many robots, such as weave")
+    if not isinstance(made, SceneTask):
+        raise ConfigError(f"task={config.task}: expected a task of many robots or of arms, such as weave")
     return made
 
 
-def feasible(task: CrowdTask, x: Tensor, ends: Tensor) -> Tensor:
+def feasible(task: SceneTask, x: Tensor, ends: Tensor) -> Tensor:
     """The audit: nothing touches on the way, straight from waypoint to waypoint; inside; ends reached; (batch,)."""
     at_ends = (x[:, [0, -1]] - ends).abs().flatten(1).amax(dim=1) <= ENDS
     return at_ends & kept(task, x)
 
 
-def kept(task: CrowdTask, x: Tensor) -> Tensor:
+def kept(task: SceneTask, x: Tensor) -> Tensor:
     """Whether trajectories (batch, any T, D) keep all that the task asks for, and stay inside, boolean (batch,)."""
     clearances = [one.swept_clearance(x).amin(dim=1) for one in task.constraints().values()]
     return ~leaves_workspace(x) & (torch.stack(clearances).amin(dim=0) >= 0)
 
 
 @torch.no_grad()
-def _look(row: Row, method: Method, asked: Sequence[tuple[CrowdTask, Tensor]], num: int) -> None:
+def _look(row: Row, method: Method, asked: Sequence[tuple[SceneTask, Tensor]], num: int) -> None:
     """What candidates are worth before descent."""
     if method.propose is None or method.raw is None:
         return
@@ -276,33 +279,36 @@ def _look(row: Row, method: Method, asked: Sequence[tuple[CrowdTask, Tensor]], n
         guided, raw = (propose(task, scene, num, 1000 * index) for propose in (method.propose, method.raw))
         row.guided_feasible += int(feasible(task, guided, y).sum())
         row.raw_feasible += int(feasible(task, raw, y).sum())
-        conflicts += (CrowdAvoidance(task.robots).clearances(raw).amin(dim=1) < 0).sum(dim=1).tolist()
+        if isinstance(task, CrowdTask):
+            conflicts += (CrowdAvoidance(task.robots).clearances(raw).amin(dim=1) < 0).sum(dim=1).tolist()
     row.raw = row.guided = num * len(asked)
-    row.conflicts = mean(conflicts)
+    row.conflicts = mean(conflicts) if conflicts else None
 
 
-def _measure(row: Row, task: CrowdTask, plans: Sequence[Tensor], law: Tensor) -> None:
-    """How good the plans of solved scenes are, and how far from single robots' (n, T, 2).
+def _measure(row: Row, task: SceneTask, plans: Sequence[Tensor], law: Tensor) -> None:
+    """How good the plans of solved scenes are, and how far from single robots' (n, T, D / robots).
 
     Those of a simulation last as long as they do, so only their paths are measured.
     """
     if not plans:
         return
     row.path_length = median(float(path_length(task.robots, x[None])) for x in plans)
-    row.adherence = mean(float((_from_line(_by_robot(x[None])) <= ADHERENCE).float().mean()) for x in plans)
+    if isinstance(task, CrowdTask):
+        away = [_from_line(_by_robot(x[None], task.robots.count)) for x in plans]
+        row.adherence = mean(float((one <= ADHERENCE).float().mean()) for one in away)
     if any(len(x) != task.T for x in plans):
         return
     x = torch.stack(list(plans))
     row.smoothness = float(smoothness(task.robots, x).median())
     distance = EnergyDistance(law)
-    distance.update(_by_robot(x)[:AT_MOST])
+    distance.update(_by_robot(x, task.robots.count)[:AT_MOST])
     found = distance.compute()
     row.energy_distance = [found[f"energy_distance{part}"] for part in ("", "_low", "_high")]
 
 
-def _by_robot(x: Tensor) -> Tensor:
-    """Trajectories (batch, T, D) of single robots, (batch robots, T, 2)."""
-    return x.unflatten(2, (-1, 2)).transpose(1, 2).flatten(0, 1)
+def _by_robot(x: Tensor, robots: int) -> Tensor:
+    """Trajectories (batch, T, D) of single robots, (batch robots, T, D / robots)."""
+    return x.unflatten(2, (robots, -1)).transpose(1, 2).flatten(0, 1)
 
 
 def _from_line(x: Tensor) -> Tensor:
@@ -322,24 +328,26 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
         console: for progress and the table.
 
     Raises:
-        ConfigError: an option that cannot be used, or a run of two robots.
+        ConfigError: an option that cannot be used, or a run of a task that is too different.
     """
     form = checked_format(options["format"])
     if commandline.whole(options, "reference", 0, 1):
         results.render(results.of_reference(), form, console)
         return
-    robots, scenes = commandline.whole(options, "n", 2, 1000), commandline.whole(options, "scenes", 1, 10**5)
+    named = load([f"task={options['task']}", "ablation=plus"])
+    robots = commandline.whole(options, "n", 2, 1000) if options["n"] else build_task(named).robots.count
+    scenes = commandline.whole(options, "scenes", 1, 10**5)
     seed, num = commandline.whole(options, "seed", 0, 2**32 - 1), commandline.whole(options, "num", 1, 10**4)
     guided = commandline.whole(options, "guided", 0, 1) == 1
     settings = Settings(num, commandline.number(options, "limit"), guided)
-    named = load([f"task={options['task']}", "ablation=plus"])
-    task = crowd(named, robots)
+    task = with_scenes(named, robots)
     models = {}
     for name in [] if options["run"] == "none" else options["run"].split(","):
         model = load_model(store.artifact(store.find_run(name), MODEL_FILE), arguments)
         taken = model.config
-        if taken.task not in CROWDS:
-            raise ConfigError(f"run={name}: is of task {taken.task}, expected one of many robots")
+        if taken.task != options["task"] and not (isinstance(task, CrowdTask) and taken.task in CROWDS):
+            crowds = " or another one of many robots" if isinstance(task, CrowdTask) else ""
+            raise ConfigError(f"run={name}: is of task {taken.task}, expected {options['task']}{crowds}")
         learned = "" if taken.task == options["task"] else f"{taken.task}-"
         models[f"{learned}{taken.ablation}-s{taken.seed}, {taken.sample.steps} steps{', guided' * guided}"] = model
     with ProgressDisplay(console) as display:
@@ -348,7 +356,7 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
     path = results.write(record, Path(options["out"]))
     picture = path.with_suffix(".png")
     success(record.task, record.robots, {row.method: (row.seconds, row.passed) for row in record.rows}, picture)
-    if record.plan:
+    if record.plan and isinstance(task, CrowdTask):
         boxes = task.in_scene(robots, seed, 0).boxes()
         animation(torch.tensor(record.plan), task.robots.radius, boxes, path.with_suffix(".gif"))
     print(f"Written: {path}, and pictures beside it", file=sys.stderr)

@@ -201,7 +201,7 @@ def test_a_model_meets_maps_and_radii_that_it_was_not_trained_on(model: ConFlow)
     settings = Settings(num=2, limit=20.0, looked=1)
     for task, robots in (("basic", 6), ("scaled_weave", 32)):
         named = config.load([f"task={task}", "ablation=plus"])
-        made = planbench.crowd(named, robots)
+        made = planbench.with_scenes(named, robots)
         scene, ends = made.in_scene(robots, 0, 0), made.scene(robots, 0, 0)
         ours = planbench.of_model("ours", model, named, settings)
         x, _ = ours.solve(scene, ends, 0)
@@ -216,10 +216,32 @@ def test_a_model_meets_maps_and_radii_that_it_was_not_trained_on(model: ConFlow)
         assert not torch.equal(there, ours.propose(elsewhere, ends, 2, 0))
 
 
+def test_arms_are_asked_scenes_too(tmp_path: Path) -> None:
+    """A scene is a function of its number; what no model made is a new demonstration between its start and goal."""
+    settings = config.load(["task=planar_arms", "ablation=plus", "preset=smoke"])
+    task = planbench.with_scenes(settings, 2)
+    assert torch.equal(task.scene(2, 1, 3), task.scene(2, 1, 3))
+    assert not torch.equal(task.scene(2, 1, 3), task.scene(2, 1, 4))
+    ends = task.scene(2, 1, 3)
+    draws = task.between(ends.expand(32, -1, -1), torch.Generator().manual_seed(0))
+    assert (draws[:, [0, -1]] - ends).abs().max() < 1e-6
+    assert bool(planbench.feasible(task, draws, ends.expand(32, -1, -1)).any())
+    model = ConFlow(settings, build_task(settings)).eval()
+    with ProgressDisplay(Console(quiet=True)) as display:
+        made = planbench.run(settings, {"ours": model}, 2, 2, 1, Settings(num=4, limit=20.0, looked=1), display)
+    assert [(row.method, row.solved) for row in made.rows] == [("descent, no model", 2), ("ours", 2)]
+    none = made.rows[0]
+    assert none.path_length is not None
+    assert (none.adherence, none.conflicts) == (None, None)
+    assert "ORCA" not in printed([made], "table")
+    with pytest.raises(ConfigError, match=r"^task planar_arms: robots=3: expected 2$"):
+        planbench.run(settings, {}, 3, 1, 1, Settings(), display)
+
+
 def test_the_benchmark_is_of_crowds_that_find_room(model: ConFlow) -> None:
     settings = Settings()
     with ProgressDisplay(Console(quiet=True)) as display:
-        with pytest.raises(ConfigError, match=r"^task=swap: expected a task of many robots, such as weave$"):
+        with pytest.raises(ConfigError, match=r"^task=swap: expected a task of many robots or of arms, such as"):
             planbench.run(config.load(), {}, 2, 1, 0, settings, display)
         crowded = config.load(["task=random", "preset=smoke"])
         with pytest.raises(ConfigError, match=r"^task random: robots=300: expected fewer"):

@@ -13,6 +13,7 @@ from rich.console import Console
 from conflow.errors import ConfigError, brief
 from conflow.results import peers, printing
 from conflow.results.printing import Format, Sheet
+from conflow.scene.tasks import CROWDS
 from conflow.tracking import store
 from conflow.training.metrics import wilson
 
@@ -181,7 +182,7 @@ def _overview(records: Sequence[Record]) -> Sheet:
         )
         for record in records
     ]
-    title = f"Scenes of many robots: solved, and mean time over all attempts, on {records[0].hardware}"
+    title = f"Scenes: solved, and mean time over all attempts, on {records[0].hardware}"
     header = ["", *(f"{record.task}, {record.robots}" for record in records)]
     return title, header, [*rows, ["published, on one large GPU", *others]]
 
@@ -204,7 +205,7 @@ def _sheet(record: Record) -> Sheet:
     for other in peers.PUBLISHED.get((record.task, record.robots), []):
         numbers = [f"{other.solved}/{other.scenes}", f"{other.seconds:g}", *[""] * (len(HEADINGS) - 3)]
         rows.append([f"published: {other.system}, {other.hardware}", *numbers])
-    if not any(row.method.startswith("ORCA") for row in record.rows):
+    if record.task in CROWDS and not any(row.method.startswith("ORCA") for row in record.rows):
         rows.append(["ORCA: not installed, pip install '.[planbench]'", *[""] * (len(HEADINGS) - 1)])
     return title, list(HEADINGS), rows
 

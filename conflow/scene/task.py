@@ -101,3 +101,19 @@ class Task(ABC):
     def boxes(self) -> Sequence[Box]:
         """Boxes that are always there, and that pictures show."""
         return ()
+
+
+class SceneTask(Task):
+    """A task whose starts and goals come as scenes that have a number, so that planners can be compared on them."""
+
+    @abstractmethod
+    def scene(self, count: int, seed: int, index: int) -> Tensor:
+        """Start and goal of a scene, a function of (task, count, seed, index) alone, (2, D) for so many robots."""
+
+    def in_scene(self, count: int, seed: int, index: int) -> "SceneTask":
+        """The task as it is in a scene, where each has a map of its own; else this one."""
+        return self
+
+    @abstractmethod
+    def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
+        """A trajectory of each robot's own, as demonstrated, for starts and goals (num, 2, D), (num, T, D)."""

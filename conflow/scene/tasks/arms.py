@@ -12,7 +12,7 @@ from conflow.scene.arm_constraints import ArmAvoidance, JointSpeed, SelfAvoidanc
 from conflow.scene.arms import Arms, Sphere
 from conflow.scene.constraint import Constraint, Sum
 from conflow.scene.settings import Ball, Obstacle
-from conflow.scene.task import Task
+from conflow.scene.task import SceneTask
 from conflow.scene.tasks.curves import uniform
 from conflow.scene.tasks.passing import warped
 
@@ -21,7 +21,7 @@ JITTER = 0.06
 Known = Literal["training", "inference", "never"]
 
 
-class ArmTask(Task):
+class ArmTask(SceneTask):
     """Arms whose joints go from `start` to `goal` and evade on the way, independently of each other.
 
     q(s) = p + s (q - p) + sin(pi s) b, with s a function of time that is another one for each arm, as in `passing`,
@@ -107,10 +107,32 @@ class ArmTask(Task):
 
     def drawn(self, num: int, generator: torch.Generator) -> Tensor:
         """Trajectories of all arms' joints in radians, float64 (num, T, D)."""
+        return self._ways(self._ends(num, generator), generator)
+
+    def scene(self, count: int, seed: int, index: int) -> Tensor:
+        if count != self.robots.count:
+            raise ValueError(f"robots={count}: expected {self.robots.count}")
+        draw = np.random.default_rng([*self.name.encode(), seed, index])
+        generator = torch.Generator().manual_seed(int(draw.integers(2**63)))
+        return self.robots.numbers(self._ends(1, generator).flatten(2)[:, 0]).float()
+
+    def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
+        q = self.robots.offset + self.robots.scale * ends.double()
+        return self.robots.numbers(self._ways(q.transpose(0, 1).unflatten(2, self._shape), generator)).float()
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """Arms, and joints of each."""
+        return len(self.robots.chains), len(self.swept[0])
+
+    def _ends(self, num: int, generator: torch.Generator) -> Tensor:
+        """Starts and goals in radians, float64 (2, num, arms, joints)."""
         ends = torch.tensor(self.swept, dtype=torch.float64)
-        p, q = (
-            ends[:, None, None] + JITTER * uniform(generator, 2, num, len(self.robots.chains), ends.shape[1]).double()
-        )
+        return ends[:, None, None] + JITTER * uniform(generator, 2, num, *self._shape).double()
+
+    def _ways(self, ends: Tensor, generator: torch.Generator) -> Tensor:
+        """Trajectories in radians, float64 (num, T, D), from p to q of ends (2, num, arms, joints)."""
+        (p, q), num = ends, ends.shape[1]
         s = warped(num, self.T, generator)[..., None]
         wave = torch.from_numpy(np.sin((torch.pi * s).numpy()))
         wave[:, :, -1] = 0  # sin(pi) in floating point is not

@@ -10,7 +10,7 @@ from torch import Tensor
 from conflow.scene.constraint import Constraint
 from conflow.scene.crowd import CrowdAvoidance, MapAvoidance
 from conflow.scene.robots import Crowd
-from conflow.scene.task import Task
+from conflow.scene.task import SceneTask, Task
 
 AMPLITUDES = (0.15, 0.075, 0.05)
 """Of the sinusoids by which a single robot leaves its straight line, as shares of its length."""
@@ -20,7 +20,7 @@ LARGEST = 0.075
 """Radius of a disc: the published starts keep 0.15 from each other."""
 
 
-class CrowdTask(Task):
+class CrowdTask(SceneTask):
     """So many discs that no joint demonstration exists: each robot's own are drawn independently, and put together.
 
     All of them collide, so a model learns from D- alone, or from what `data.repair` makes of it.
@@ -60,21 +60,18 @@ class CrowdTask(Task):
         """Starts and goals of one scene, (count, 2) each."""
 
     def in_scene(self, count: int, seed: int, index: int) -> "CrowdTask":
-        """The task as it is in a scene, where each has a map of its own; else this one."""
         return self
 
     def scene(self, count: int, seed: int, index: int) -> Tensor:
-        """Start and goal of a scene, a function of (task, count, seed, index) alone, (2, 2 count)."""
         made = self.in_scene(count, seed, index)
         start, goal = made.ends(count, np.random.default_rng([*self.name.encode(), count, seed, index]))
         return torch.from_numpy(np.stack([start, goal]).reshape(2, -1)).float()
 
     def demonstrations(self, num: int, seed: int) -> Tensor:
         scenes = torch.stack([self.scene(self.robots.count, seed, index) for index in range(num)])
-        return self.singles(scenes, torch.Generator().manual_seed(seed))
+        return self.between(scenes, torch.Generator().manual_seed(seed))
 
-    def singles(self, ends: Tensor, generator: torch.Generator) -> Tensor:
-        """A trajectory of each robot's own for starts and goals (num, 2, D), (num, T, D)."""
+    def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
         return singles(ends, self.T, generator)
 
 

@@ -43,7 +43,7 @@ class Random(CrowdTask):
                 return found
         raise ValueError(f"robots={count}: expected fewer, so many find no room {self.apart} apart")
 
-    def singles(self, ends: Tensor, generator: torch.Generator) -> Tensor:
+    def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
         """Nearly straight, along the walls where that would leave the square; in a map on a way through it."""
         if not self.boxes():
             return singles(ends, self.T, generator).clamp(-1, 1)
