@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import textwrap
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,13 @@ from conflow.planner import PlanError, Planner
 from conflow.scene.arm_constraints import FAR, SphereAvoidance
 from conflow.scene.measures import leaves_workspace
 from conflow.scene.settings import Ball
-from conflow.scene.tasks import ARMS
+from conflow.scene.tasks import ARMS, arms
 from conflow.scene.tasks.arms import ArmTask
 from conflow.training import config
 from conflow.training.build import build_task
 from conflow.training.model_file import load_model
 from conflow.training.module import Training
+from tests.conftest import Command
 
 tasks = pytest.mark.parametrize("name", sorted(ARMS))
 
@@ -140,6 +142,17 @@ def test_the_readme_s_lines_plan_for_two_pandas(monkeypatch: pytest.MonkeyPatch)
     plans = known["plans"]
     assert plans.x.shape == (64, 32, 14)
     assert plans.x[0, 0].tolist() == pytest.approx([-0.8, *known["rest"]] * 2)
+
+
+def test_another_arm_takes_the_thirty_lines_that_are_shown(conflow: Command, workplace: Path) -> None:
+    """Its constants, its spheres and how it evades, as the module of arms has them."""
+    assert arms.__doc__ is not None
+    lines = textwrap.dedent(arms.__doc__.split("\n\n", 2)[2])
+    assert len(lines.splitlines()) <= 30
+    (workplace / "three_links.py").write_text(lines)
+    result = conflow("train", "task=three_links.py", "ablation=plus", "preset=smoke", "data.num=100")
+    assert result.returncode == 0, result.stderr
+    assert "violate arms, 0.0% violate self, 0.0% violate speed" in result.stdout
 
 
 def test_a_run_of_arms_is_loaded_with_its_scales(tmp_path: object) -> None:

@@ -1,12 +1,15 @@
+import os
+import warnings
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from lightning.fabric.plugins.environments import SLURMEnvironment
 from mlflow.entities import Run
 
 from conflow.errors import ConfigError
-from conflow.training import config
+from conflow.training import config, train
 from conflow.training.build import random_stream
 from conflow.training.datamodule import DemonstrationData
 from conflow.training.metrics import trajectory_metrics
@@ -179,3 +182,16 @@ def test_a_run_is_not_judged_on_data_that_have_changed_since(trained: tuple[Run,
     assert demonstrations(run, model_of(config.load(SETTINGS_ARGUMENTS))).digest == run.data.tags["data_digest"]
     with pytest.raises(ConfigError, match="on which cgp-s3 was trained"):
         demonstrations(run, model_of(config.load([*SETTINGS_ARGUMENTS, "data.seed=1"])))
+
+
+def test_a_machine_with_slurm_hears_no_advice_that_is_not_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    srun = tmp_path / "srun"
+    srun.touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with warnings.catch_warnings(record=True) as advised:
+        warnings.simplefilter("always")
+        SLURMEnvironment.detect()
+        assert len(advised) == 1
+        train._quiet()
+        SLURMEnvironment.detect()
+    assert len(advised) == 1

@@ -180,7 +180,8 @@ def _quiet() -> None:
     """Silence what libraries say that no user of ours can act on."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     messages = (".*does not have many workers.*", ".*LeafSpec.*", ".*smaller than the logging interval.*")
-    for message in (*messages, ".*sync_dist=True.*", ".*broadcast_buffers.*"):
+    # Where there is SLURM it says how to be started by that; ranks are started by torchrun.
+    for message in (*messages, ".*sync_dist=True.*", ".*broadcast_buffers.*", ".*`srun` command is available.*"):
         warnings.filterwarnings("ignore", message)
 
 

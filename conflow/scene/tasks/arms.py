@@ -1,4 +1,33 @@
-"""Two arms that share a workspace and swap sides: what all such tasks have in common."""
+"""Two arms that share a workspace and swap sides: what all such tasks have in common.
+
+Another arm takes its constants and its spheres. With this in `three_links.py`, `make train TASK=three_links.py`:
+
+    from math import pi
+    import torch
+    from conflow.scene.arms import Arms, Base, Body, Chain
+    from conflow.scene.tasks.arms import ArmTask
+
+    LINK = [(0.06 + 0.12 * k, 0, 0, 0.05) for k in range(3)]  # (x, y, z, radius) in its link's frame, in metres
+    ARM = Chain(
+        joints=[(0, 0, 0), (0.4, 0, 0), (0.4, 0, 0)],  # (a, alpha, d) of Craig's modified Denavit-Hartenberg
+        low=[-3] * 3,  # radians
+        high=[3] * 3,
+        speed=[4] * 3,  # radians per second
+        bodies=[Body(1, LINK), Body(2, LINK), Body(3, LINK)],
+        hand=(0.4, 0, 0),
+    )
+
+    class ThreeLinks(ArmTask):
+        T = 64
+        swept = (-pi / 4, 0, 0), (pi / 4, 0, 0)  # the joints of one arm at start and goal
+
+        def __init__(self):
+            super().__init__(Arms([ARM, ARM], [Base(-0.94), Base(0.94, turn=pi)], axes=2))
+
+        def deviations(self, num, generator):  # added halfway to the straight way, (num, arms, joints)
+            fold = 1.3 * torch.rand(num, 2, generator=generator).double()
+            return torch.stack([0 * fold, fold, -2 * fold], dim=2)
+"""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -41,7 +70,9 @@ class ArmTask(SceneTask):
     seconds = 4.0
     robots: Arms
 
-    def __init__(self, robots: Arms, spheres: Sequence[Sphere], obstacles: Known, singles: int) -> None:
+    def __init__(
+        self, robots: Arms, spheres: Sequence[Sphere] = (), obstacles: Known = "never", singles: int = 0
+    ) -> None:
         if obstacles not in get_args(Known):
             raise ValueError(f"obstacles={obstacles}: expected one of {', '.join(get_args(Known))}")
         if type(singles) is not int or singles < 0:
