@@ -126,9 +126,14 @@ def _mixture_distance(negatives: Tensor, feasible: Tensor) -> Metrics:
     return {name: p**2 * value for name, value in metric.compute().items()}
 
 
+def latency_batch(D: int) -> int:
+    """Trajectories in the batch whose time is taken: 256 of two robots in the plane, fewer of what has more numbers."""
+    return max(1, 4 * LATENCY_BATCH // D)
+
+
 def _latency_ms(model: ConFlow, x_1: Tensor, setting: str, repetitions: int = 3) -> float:
-    """Median time of sampling one batch, in milliseconds: 256 trajectories of two robots, fewer of more."""
-    x_1 = cycle(x_1, max(1, 2 * LATENCY_BATCH // model.task.robots.count))
+    """Median time of sampling one batch, in milliseconds."""
+    x_1 = cycle(x_1, latency_batch(x_1.shape[2]))
     times = []
     for _ in range(repetitions):
         start = time.perf_counter()

@@ -54,4 +54,4 @@ def evaluate_again(
         logger.log_metrics(evaluation.keyed(f"{group}/", baseline=False), 0)
         logger.save()
     title = f"{model.config.preset}/{run.info.run_name}, {label}, {SPLITS[split]} split"
-    console.print(summary.results_table(evaluation.results, title))
+    console.print(summary.results_table(evaluation, title))

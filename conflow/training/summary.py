@@ -2,7 +2,7 @@
 
 from rich.table import Table
 
-from conflow.training.evaluation import Metrics
+from conflow.training.evaluation import Evaluation, Metrics, latency_batch
 
 ROWS = {
     "success_rate": "success rate",
@@ -17,8 +17,9 @@ ROWS = {
 }
 
 
-def results_table(results: dict[str, Metrics], title: str) -> Table:
+def results_table(evaluation: Evaluation, title: str) -> Table:
     """The metrics of one run on a split, a column for each setting, each with its 95 % interval."""
+    results, batch = evaluation.results, latency_batch(evaluation.source_samples.shape[2])
     num = int(next(iter(results.values()))["num"])
     made = Table(title=title, caption=f"{num} trajectories a setting; in brackets 95 % intervals")
     made.add_column("metric")
@@ -26,7 +27,7 @@ def results_table(results: dict[str, Metrics], title: str) -> Table:
         made.add_column(setting, justify="right")
     for key, label in (_collisions(next(iter(results.values()))) | ROWS).items():
         made.add_row(label, *(_result(metrics, key) for metrics in results.values()))
-    made.add_row("ms for a batch of 256", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
+    made.add_row(f"ms for a batch of {batch}", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
     return made
 
 

@@ -105,7 +105,7 @@ def train(
                 draw(model, data, validated, Path(folder, "figures"))
             logger.log_files(folder)
     title = f"{config.name}, preset {config.preset}, {SPLITS[split]} split"
-    console.print(summary.results_table((validated if split == "val" else tested).results, title))
+    console.print(summary.results_table(validated if split == "val" else tested, title))
     return run_id
 
 
