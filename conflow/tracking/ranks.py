@@ -4,16 +4,19 @@
 many there are is no part of what an experiment is: each draws the whole batch from (seed, step) and takes its share,
 so the gradient is that of one process up to rounding. Rank 0 alone touches the store, prints and evaluates.
 
-On several nodes the same command runs once on each, with torchrun's own options. For SLURM:
+On several nodes the same command runs once on each, with torchrun's own options. For SLURM, as `train.sh`:
 
     #!/bin/bash
     #SBATCH --nodes=2 --ntasks-per-node=1 --gpus-per-node=4 --cpus-per-task=32
     export MASTER=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
-    srun bash -c 'python -m torch.distributed.run --nnodes=$SLURM_NNODES --node-rank=$SLURM_NODEID \
-        --master-addr=$MASTER --master-port=29500 --nproc-per-node=4 -m conflow train ablation=plus preset=paper'
+    srun --cpus-per-task=$SLURM_CPUS_PER_TASK bash -c 'python -m torch.distributed.run --nnodes=$SLURM_NNODES \
+        --node-rank=$SLURM_NODEID --master-addr=$MASTER --master-port=29500 --nproc-per-node=$SLURM_GPUS_ON_NODE \
+        -m conflow train "$@"' conflow "$@"
 
-Here the node of rank 0 is always the first, where `runs/` is. What reads no file of its own, such as the demonstrations
-of `data.path`, needs no folder that the nodes share: a run goes on from the checkpoint that rank 0 reads.
+Then `sbatch train.sh ablation=plus preset=paper` trains, and with `resume=latest` as well goes on with what a cancelled
+job has left. The node of rank 0 is always the job's first, where `runs/` is. What reads no file of its own, such as the
+demonstrations of `data.path`, needs no folder that the nodes share: a run goes on from the checkpoint that rank 0
+reads.
 
 Imports torch only where there are several, since the command line asks for the rank before anything else.
 """
