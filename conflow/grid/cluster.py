@@ -19,7 +19,7 @@ from typing import Any
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to report to its makers
 
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import AuthenticationError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from rich.console import Console
 
@@ -139,9 +139,15 @@ def _connect(address: str) -> None:
     try:
         _check_reachable(address)
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except AuthenticationError as error:
+        reason = str(error).partition(". ")[0]
+        raise ConfigError(
+            f"cluster={address}: {reason}; expected that of the cluster, see ray get-auth-token"
+        ) from None
     except (OSError, ValueError, RuntimeError) as error:
         raise ConfigError(
-            f"cluster={address}: {error}; expected a Ray cluster of which this machine is a node, try: ray start --head"
+            f"cluster={address}: {error}; expected a Ray cluster of which this machine is a node, try: ray start "
+            "--head; one that wants a token: export RAY_AUTH_MODE=token"
         ) from None
     finally:
         signal.signal(signal.SIGTERM, handler)

@@ -193,3 +193,16 @@ def test_a_cluster_that_cannot_be_used_is_refused_in_one_line(
         assert driver.wait(120) == 2
     (line,) = (tmp_path / "output").read_text().splitlines()
     assert line.startswith(f"conflow: {said}")
+
+
+def test_a_driver_without_the_clusters_token_is_refused_in_one_line(
+    cluster: Any, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(tmp_path / "none"))
+    driver = grid(tmp_path, cluster, server, "seeds=0", "ablations=cgp")
+    with stopped_afterwards(driver):
+        assert driver.wait(120) == 2
+    (line,) = (tmp_path / "output").read_text().splitlines()
+    assert line.startswith("conflow: cluster=")
+    assert line.endswith("; expected that of the cluster, see ray get-auth-token")
