@@ -349,7 +349,9 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
             crowds = " or another one of many robots" if isinstance(task, CrowdTask) else ""
             raise ConfigError(f"run={name}: is of task {taken.task}, expected {options['task']}{crowds}")
         learned = "" if taken.task == options["task"] else f"{taken.task}-"
-        models[f"{learned}{taken.ablation}-s{taken.seed}, {taken.sample.steps} steps{', guided' * guided}"] = model
+        solver = "" if taken.sample.solver == "euler" else f"{taken.sample.solver} "
+        steps = f"{taken.sample.steps} {solver}steps{', guided' * guided}"
+        models[f"{learned}{taken.ablation}-s{taken.seed}, {steps}"] = model
     with ProgressDisplay(console) as display:
         record = run(named, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -41,7 +42,23 @@ class Attempt:
         if self.frozen_at:
             # Every flush writes, so that what is written after the thaw would be seen.
             recording.FLUSH_SECONDS = 0.0
-            _before(*STEP, self.frozen_at, lambda: os.kill(os.getpid(), signal.SIGSTOP))
+            _before(*STEP, self.frozen_at, _freeze_between_beats())
+
+
+def _freeze_between_beats() -> Callable[[], None]:
+    """Stops the process, but not in the middle of a beat: nobody else could use an SQLite file that it then locks."""
+    beating, original = threading.Lock(), liveness.Claim._beat
+
+    def beat(claim: liveness.Claim) -> None:
+        with beating:
+            original(claim)
+
+    def freeze() -> None:
+        with beating:
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+    liveness.Claim._beat = beat  # type: ignore[method-assign, assignment]
+    return freeze
 
 
 def _before(module: str, name: str, call: int, act: Callable[[], None]) -> None:
