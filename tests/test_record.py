@@ -15,7 +15,7 @@ from scipy import stats
 from conflow.errors import ConfigError
 from conflow.results import comparison, paper, printing, records
 from conflow.results.records import Record
-from conflow.results.tables import Cell
+from conflow.results.tables import Cell, tables
 from conflow.tracking import code, store
 from conflow.training.config import flatten, load
 from conflow.training.metrics import wilson
@@ -234,6 +234,16 @@ def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
     assert found.commands[reading] == (
         "make ablations ABLATIONS=cgp SEEDS=\"0 1 2\" PRESET=quick ARGS='constraint.reduction=closest'"
     )
+
+
+def test_readings_of_another_task_show_its_own_collisions() -> None:
+    """Of arms, which have no robots' discs that could collide."""
+    path = Path(__file__).parents[1] / "runs/reference/runs/pandas-no_negatives-quick-sample.steps=25-s0.json"
+    shown = {cell.column: cell.count for cell in tables({}, {"a reading": [Record.read(path)]})}
+    assert shown["none: arms"] == Record.read(path).metrics["test/none/arms_collision_count"]
+    assert shown["all: speed"] == Record.read(path).metrics["test/all/speed_collision_count"]
+    assert {"none: success", "smoothness, median"} <= shown.keys()
+    assert "none: robot" not in shown
 
 
 def test_the_command_of_a_row_stands_beside_it() -> None:

@@ -81,13 +81,13 @@ ELSEWHERE = {
     "test/none/energy_distance": "energy distance to held-out D+",
     "test/robot/energy_distance": "robot: energy distance to held-out D+",
 }
+ALSO_READ = {"none/smoothness_median": "smoothness, median", "none/start_error": "start error per robot"}
 READINGS = {
     "none/robot_collision": "none: robot",
     "robot/robot_collision": "robot: robot",
     "obstacle/robot_collision": "obstacle: robot",
     "obstacle/object_collision": "obstacle: object",
-    "none/smoothness_median": "smoothness, median",
-    "none/start_error": "start error per robot",
+    **ALSO_READ,
 }
 Interval = tuple[float | None, float | None]
 NONE: Interval = (None, None)
@@ -208,8 +208,17 @@ def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Recor
     return [
         cell("4", row, column, None, prefix + metric, of_row)
         for row, prefix, of_row in rows
-        for metric, column in READINGS.items()
+        for metric, column in _of_readings({**runs, **readings}).items()
     ]
+
+
+def _of_readings(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
+    """The columns of Table 4; of another task than a swap all its collisions, and success."""
+    columns = collisions(runs)
+    if columns is COLLISIONS:
+        return READINGS
+    own = {metric.removeprefix("test/"): column for metric, column in columns.items()}
+    return own | {"none/success": "none: success"} | ALSO_READ
 
 
 def _on_other_data(run: Record) -> bool:
