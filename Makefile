@@ -26,7 +26,7 @@ GOAL     ?=
 OUT      ?=
 NUM      ?=
 PORT     ?= 5000
-# Of `make planbench`.
+# Of `make planbench`; how many robots is the task's own number unless given.
 N        ?=
 SCENES   ?= 64
 ARGS     ?=

@@ -216,7 +216,7 @@ def test_a_model_meets_maps_and_radii_that_it_was_not_trained_on(model: ConFlow)
         assert not torch.equal(there, ours.propose(elsewhere, ends, 2, 0))
 
 
-def test_arms_are_asked_scenes_too(tmp_path: Path) -> None:
+def test_arms_are_asked_scenes_too() -> None:
     """A scene is a function of its number; what no model made is a new demonstration between its start and goal."""
     settings = config.load(["task=planar_arms", "ablation=plus", "preset=smoke"])
     task = planbench.with_scenes(settings, 2)
