@@ -273,6 +273,7 @@ def test_fitting_the_standard_normal_is_refused() -> None:
         (["correction.at=end", "correction.path=guided"], "correction.path=guided: expected correction.at=point"),
         (["data.negative_share=0.1", "data.negatives=false"], "data.negative_share=0.1: expected data.negatives=true"),
         (["data.repair=true"], "correction.margin=0.0: expected a number above 0 where data.repair=true"),
+        (["data.unrepaired=0.3"], "data.unrepaired=0.3: expected data.repair=true"),
         (["source.kind=gaussian", "network.kind=spectral"], "source.kind=gaussian: expected gp or cgp"),
         (["source.kind=gaussian", "correction.smoothing=covariant"], "source.kind=gaussian: expected gp or cgp"),
     ],

@@ -149,6 +149,27 @@ def test_repaired_demonstrations_are_all_feasible_and_feasible_ones_are_not_touc
     assert torch.equal(repaired.test.x, mixed.test.x)
 
 
+def test_a_share_of_the_demonstrations_is_left_unrepaired() -> None:
+    def train(*more: str) -> Split:
+        return DemonstrationData(config.load(["preset=smoke", "ablation=repair", *more])).train
+
+    raw, repaired, some = train("data.repair=false"), train(), train("data.unrepaired=0.3")
+    left = round(0.3 * len(raw.x))
+    assert torch.equal(some.x[:left], raw.x[:left])
+    assert torch.equal(some.violates[:left], raw.violates[:left])
+    assert torch.equal(some.x[left:], repaired.x[left:])
+    assert not some.violates[left:].any()
+
+
+def test_what_is_repaired_does_not_depend_on_the_source() -> None:
+    """Or two sources would be compared on different demonstrations."""
+    by_cgp, by_gaussian = (
+        DemonstrationData(config.load(["preset=smoke", "ablation=repair", f"source.kind={kind}"]))
+        for kind in ("cgp", "gaussian")
+    )
+    assert torch.equal(by_cgp.train.x, by_gaussian.train.x)
+
+
 class Carts(Robots):
     D, radii, owner = 3, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.long)
 

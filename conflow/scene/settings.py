@@ -24,6 +24,7 @@ class Data:
     negatives: bool
     negative_share: Annotated[float | None, {"low": 0, "high": 1}]
     repair: bool
+    unrepaired: Annotated[float, {"low": 0, "high": 1}]
     val_fraction: Annotated[float, {"above": 0, "high": 1}]
     test_fraction: Annotated[float, {"above": 0, "high": 1}]
 

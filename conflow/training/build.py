@@ -258,8 +258,11 @@ def descending(settings: Config, task: Task, source: Source, more: Sequence[Cons
 
 
 def repaired(settings: Config, task: Task, x: Tensor) -> Tensor:
-    """Demonstrations x (N, T, D), those in violation moved out of it by the margin, along the source's covariance."""
-    u_c = descending(settings, task, build_source(settings.source, x.shape[1]))
+    """Demonstrations x (N, T, D), those in violation moved out of it by the margin, along the CGP's covariance.
+
+    Along that one whatever the source is, so that all sources are shown the same.
+    """
+    u_c = descending(settings, task, build_source(replace(settings.source, kind="cgp"), x.shape[1]))
     return in_pieces(lambda piece: descend(piece, u_c, REPAIR_STEPS, MOMENTUM), x)
 
 

@@ -489,6 +489,10 @@ def _check(config: Config) -> None:
     if config.data.repair and not config.correction.margin:
         # Repair comes as near to the boundary as it wants, from within: without a margin the label would not change.
         raise ConfigError("correction.margin=0.0: expected a number above 0 where data.repair=true")
+    if config.data.unrepaired and not config.data.repair:
+        raise ConfigError(
+            f"data.unrepaired={config.data.unrepaired}: expected data.repair=true, of which it is the rest"
+        )
     if config.constraint.pairs == "all" and config.constraint.reduction == "closest":
         # The closest approach is one pair's; all of them at every waypoint are the sum.
         expected = "expected sum or mean where constraint.pairs=all, or constraint.pairs=nearest"

@@ -219,7 +219,9 @@ class DemonstrationData(LightningDataModule):
         return found
 
     def _repaired(self, split: Split, task: Task) -> Split:
-        return self._labelled(repaired(self.config, task, split.x), task)
+        """The trajectories of a split, but for a share `data.unrepaired`, out of collision, with new labels."""
+        left, moved = split.x.tensor_split([round(self.config.data.unrepaired * len(split.x))])
+        return self._labelled(torch.cat([left, repaired(self.config, task, moved)]), task)
 
     def _labelled(self, x: Tensor, task: Task) -> Split:
         return Split(x, labels(self.config, task).violation(x))
