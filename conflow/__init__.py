@@ -1,7 +1,8 @@
 """ConFlow: flow matching for robot motion with the constraint inside the training.
 
 What programs need has its name here, and is imported when it is asked for: `conflow.train`, `conflow.compare`,
-`conflow.Planner`, and for tasks of one's own `conflow.Task`, `conflow.Constraint` and what they are made of.
+`conflow.Planner`, `conflow.DescentPlanner` without a model, and for tasks of one's own `conflow.Task`,
+`conflow.Constraint` and what they are made of.
 """
 
 import importlib
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from conflow.api import compare, train
-    from conflow.planner import Planner, Plans
+    from conflow.planner import DescentPlanner, Planner, Plans
     from conflow.scene.constraint import (
         AccelerationLimit,
         Constraint,
@@ -29,6 +30,7 @@ __all__ = [
     "AccelerationLimit",
     "Constraint",
     "Demonstrations",
+    "DescentPlanner",
     "Discs",
     "Obstacle",
     "ObstacleAvoidance",
@@ -45,7 +47,7 @@ __all__ = [
 
 _PLACES = {
     "api": ("compare", "train"),
-    "planner": ("Planner", "Plans"),
+    "planner": ("DescentPlanner", "Planner", "Plans"),
     "scene.constraint": (
         *("AccelerationLimit", "Constraint", "ObstacleAvoidance", "RobotAvoidance", "SpeedLimit", "Workspace"),
     ),

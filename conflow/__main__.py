@@ -149,7 +149,10 @@ def reference(arguments: list[str]) -> None:
 
 
 def sample(arguments: list[str]) -> None:
-    """Plan from start= to goal= and draw: run=latest out=plans.npz num=64 seed=0 guidance=all obstacle=x,y,r via=s,x"""
+    """Plan from start= to goal= and draw: run=latest out=plans.npz num=64 seed=0 guidance=all obstacle=x,y,r via=s,x
+
+    With run=none without a model, for task=NAME.
+    """
     from conflow import commandline
     from conflow.tracking import signals
 

@@ -3,6 +3,8 @@
     plans = Planner.load("latest").plan(start=(-0.8, 0, 0.8, 0), goal=(0.8, 0, -0.8, 0))
     best, clearance = plans.x[0], plans.clearance[0]
 
+Or without a model: `DescentPlanner.of("swap")` instead.
+
 With a `model.ckpt` in place of a run in the store it needs torch and numpy alone.
 """
 
@@ -25,11 +27,23 @@ from conflow.flow.correction import Correction, descend, descent
 from conflow.flow.sampler import Field, in_pieces, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, Sum
+from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.measures import leaves_workspace, smoothness
 from conflow.scene.robots import Crowd
 from conflow.scene.settings import Ball, Obstacle
-from conflow.scene.task import Task
-from conflow.training.build import MOMENTUM, NONE, barrier, descending, random_stream
+from conflow.scene.task import SceneTask, Task
+from conflow.scene.tasks import TASKS
+from conflow.training import config
+from conflow.training.build import (
+    MOMENTUM,
+    NONE,
+    REPAIR_STEPS,
+    barrier,
+    build_task,
+    descending,
+    fitted,
+    random_stream,
+)
 from conflow.training.config import Range
 from conflow.training.memory import check_memory
 from conflow.training.model import ConFlow, start_and_goal
@@ -38,8 +52,12 @@ from conflow.training.model_file import MODEL_FILE, TaskError, load_model
 ALL, AROUND_OBSTACLES = "all", "obstacle"
 CHECKED, ROUNDS = 5, 12
 """Steps of descent between two looks at candidates, and looks until others are drawn."""
+FITTED_TO = 1000
+"""Demonstrations that a source is fitted to where there is no model."""
 Numbers = ArrayLike | Tensor
 ViaPoint = tuple[float, Numbers]
+Flow = Callable[[Tensor, Tensor], Tensor]
+"""Where samples x_0 of the source (num, T, D) come to, for starts and goals (num, 2, D)."""
 
 
 class PlanError(ConfigError):
@@ -185,7 +203,7 @@ class Planner:
             return integrate(v, x_0, sample.steps, sample.solver)
 
         index = (0, *points, -1)
-        x = self._sample(arrive, self._inside(y), index, num, seed)
+        x = self._candidates(arrive, self._inside(y), index, num, seed)
         if steps:
             u_c = self._descending(discs, index)
             x = in_pieces(lambda x: descend(x, u_c, steps, MOMENTUM), x.flatten(0, 1)).view_as(x)
@@ -247,7 +265,7 @@ class Planner:
             return self
         D = _numbers("start", start, "numbers of shape (D,) or (B, D)").shape[-1:]
         known = D in ((), (self.model.D,)) or D[0] < 4 or D[0] % 2
-        return self if known else Planner(self.model.of_numbers(D[0]))
+        return self if known else type(self)(self.model.of_numbers(D[0]))
 
     def _met(self, discs: Sequence[Obstacle]) -> dict[str, Constraint]:
         """What plans are judged by: all that training keeps, and obstacles."""
@@ -377,9 +395,7 @@ class Planner:
         except ValueError as error:
             raise PlanError(str(error)) from None
 
-    def _sample(
-        self, arrive: Callable[[Tensor, Tensor], Tensor], y: Tensor, index: Sequence[int], num: int, seed: int
-    ) -> Tensor:
+    def _candidates(self, arrive: Flow, y: Tensor, index: Sequence[int], num: int, seed: int) -> Tensor:
         """`num` trajectories for each row of y (B, O, D), which they meet at the waypoints `index`: (B, num, T, D).
 
         `arrive` takes samples x_0 of the source to x_1, for their starts and goals.
@@ -389,9 +405,56 @@ class Planner:
         except ValueError as error:
             raise PlanError(f"via: {error}") from None
         # Each pair's own draws, so that they do not depend on the other pairs.
-        x_0 = torch.cat([source.sample(pair.expand(num, -1, -1), random_stream("plan", seed)) for pair in y])
+        drawn = [self._drawn(source, pair.expand(num, -1, -1), random_stream("plan", seed)) for pair in y]
         y = y.repeat_interleave(num, dim=0)
-        return exact(source, in_pieces(arrive, x_0, start_and_goal(y)), y).unflatten(0, (-1, num))
+        return exact(source, in_pieces(arrive, torch.cat(drawn), start_and_goal(y)), y).unflatten(0, (-1, num))
+
+    def _drawn(self, source: Source, y: Tensor, noise: torch.Generator) -> Tensor:
+        """x_0, (num, T, D), for rows of y (num, O, D) at the waypoints at which the source is conditioned."""
+        return source.sample(y, noise)
+
+
+class DescentPlanner(Planner):
+    """Plans without a model: candidates are demonstrations drawn anew, and descent alone makes them feasible.
+
+        plans = DescentPlanner.of("weave").best_of(start, goal)
+
+    In crowds and with arms a candidate is made of each robot's own way; in other tasks it is a sample of the source
+    that is most likely for the demonstrations. Nothing is trained, so nothing of the task is learned but that.
+    """
+
+    @classmethod
+    def of(cls, task: Task | str, **settings: Any) -> "DescentPlanner":
+        """The planner of a task.
+
+        Args:
+            task: its name, or a task, such as one of one's own or one in the map of a scene.
+            settings: of `config.load`, with two underscores in place of a dot, such as `correction__margin=0.05`.
+
+        Raises:
+            ConfigError: there is no such task, or a setting that cannot be used.
+        """
+        name = task if isinstance(task, str) else task.name if task.name in TASKS else config.PAPERS_TASK
+        given = [f"{key.replace('__', '.')}={value}" for key, value in settings.items()]
+        chosen = config.load(
+            [f"task={name}", "ablation=plus", f"sample.descent={REPAIR_STEPS}", "sample.steps=1", *given]
+        )
+        made = build_task(chosen) if isinstance(task, str) else task
+        if not isinstance(made, SceneTask):
+            found = made.demonstrations(FITTED_TO, chosen.data.seed)
+            chosen = fitted(chosen, found.x if isinstance(found, Demonstrations) else found)
+        return cls(ConFlow(chosen, made))
+
+    def _drawn(self, source: Source, y: Tensor, noise: torch.Generator) -> Tensor:
+        task = self.model.task
+        return task.between(y[:, [0, -1]], noise) if isinstance(task, SceneTask) else source.sample(y, noise)
+
+    def _field(self, ends: Tensor, guidance: str | None, *more: Any) -> Field:
+        if guidance not in (ALL, NONE, None):
+            raise PlanError(
+                f"guidance={brief(guidance)}: expected all or none, without a model there is no flow to guide"
+            )
+        return lambda x, t: torch.zeros_like(x)
 
 
 def looks(propose: Callable[[int], Tensor], u_c: Correction) -> Iterator[Tensor]:

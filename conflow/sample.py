@@ -9,9 +9,13 @@ import numpy as np
 
 from conflow import commandline
 from conflow.figures.plans import picture
-from conflow.planner import PlanError, Planner, Plans
+from conflow.planner import DescentPlanner, PlanError, Planner, Plans
 from conflow.scene.task import Task
+from conflow.training.config import PAPERS_TASK
 from conflow.training.metrics import wilson
+
+WITHOUT = "none"
+"""In place of a run: a plan without a model."""
 
 
 def sample(
@@ -20,10 +24,10 @@ def sample(
     """Plan for one pair as the command line asks, write the plans and their picture, and say what came of it.
 
     Args:
-        options: run, start, goal, out, num, guidance and seed.
+        options: run, start, goal, out, num, guidance and seed; task, where run is `none`.
         obstacles: each as "x,y,radius".
         via: each as "s,x1,y1,...", a waypoint to pass at the share s of the way.
-        task: of a run on a task of one's own.
+        task: one's own, where it is of that.
 
     Raises:
         ConfigError: an option that cannot be used, or as `Planner.load` and `Planner.plan`; a file exists already.
@@ -33,14 +37,18 @@ def sample(
     discs = [_parsed("obstacle", text) for text in obstacles]
     points = [(s, point) for s, *point in (_parsed("via", text) for text in via)]
     num, seed = commandline.whole(options, "num", 1, 10**6), commandline.whole(options, "seed", 0, 2**32 - 1)
-    planner = Planner.load(options["run"], task)
+    without = options["run"] == WITHOUT
+    planner = (
+        DescentPlanner.of(task or options["task"] or PAPERS_TASK) if without else Planner.load(options["run"], task)
+    )
     plans = planner.plan(start, goal, num, discs, points, options["guidance"], seed)
     _save(out, planner, plans, start, goal, discs)
     feasible = int(plans.feasible.sum())
     low, high = wilson(feasible, num)
     taken = planner.model.config
+    origin = f"Task {planner.model.task.name}, without a model" if without else f"Run {taken.preset}/{taken.name}"
     return (
-        f"Run {taken.preset}/{taken.name}: {feasible} of {num} plans are feasible, {feasible / num:.1%} (95 % interval "
+        f"{origin}: {feasible} of {num} plans are feasible, {feasible / num:.1%} (95 % interval "
         f"{low:.1%} to {high:.1%}); best clearance {float(plans.clearance.max()):.3f}\n"
         f"Written: {out} and {out.with_suffix('.png')}"
     )

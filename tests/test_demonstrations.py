@@ -421,6 +421,7 @@ def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: 
         (("demonstrations",), ["demonstrations", "task=swap", "seed=0"]),
         (("sample", "OUT=a.npz", "NUM=7"), ["sample", "run=latest", "start=", "goal=", "out=a.npz", "num=7", "seed=0"]),
         (("sample",), ["sample", "run=latest", "start=", "goal=", "seed=0"]),
+        (("sample", "RUN=none"), ["sample", "task=swap", "run=none", "start=", "goal=", "seed=0"]),
     ],
 )
 def test_make_passes_on_what_is_given(arguments: tuple[str, ...], expected: list[str]) -> None:

@@ -21,12 +21,15 @@ from conflow.figures.plans import picture
 from conflow.figures.workspace import NAMED
 from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
-from conflow.planner import PlanError, Planner, Plans, _ranked, exact
+from conflow.planner import DescentPlanner, PlanError, Planner, Plans, _ranked, exact
 from conflow.scene.constraint import Constraint, ObstacleAvoidance, RobotAvoidance
 from conflow.scene.robots import Discs, Robots
 from conflow.scene.settings import Obstacle
-from conflow.scene.task import Task
+from conflow.scene.task import SceneTask, Task
+from conflow.scene.tasks.maps import Room
+from conflow.scene.tasks.pandas import Pandas
 from conflow.scene.tasks.swap import swap
+from conflow.scene.tasks.weave import Weave
 from conflow.tracking import store
 from conflow.training import config
 from conflow.training.build import fitted, random_stream
@@ -836,3 +839,51 @@ def test_a_bad_command_ends_in_one_line_and_writes_nothing(
     assert err.count("\n") == 1
     assert re.search(said, err)
     assert [path.name for path in Path().iterdir()] == ["model.ckpt"]
+
+
+def test_a_plan_without_a_model_meets_start_goal_and_via_points_clear_of_all_obstacles() -> None:
+    plans = DescentPlanner.of("swap").plan([START, START], [GOAL, GOAL], 16, [DISC], VIA)
+    assert plans.feasible.all()
+    assert torch.equal(plans.x[0], plans.x[1])
+    assert torch.equal(
+        plans.x[:, :, [0, 8, 16, -1]], torch.tensor([START, VIA[1][1], VIA[0][1], GOAL]).expand(2, 16, -1, -1)
+    )
+    assert min(clearance(x, [DISC]) for x in plans.x[0]) >= -1e-6  # of float32
+    assert not torch.equal(plans.x[0, 0], plans.x[0, 1])
+
+
+@pytest.mark.parametrize("task", [Weave(28), Room(9).in_scene(9, 0, 3), Pandas()])
+def test_a_plan_without_a_model_is_found_from_each_robots_own_way(task: SceneTask) -> None:
+    start, goal = task.scene(task.robots.count, 0, 3)
+    flow = DescentPlanner.of(task)
+    start, goal = (flow.scale * end + flow.offset for end in (start, goal))
+    best = flow.best_of(start, goal, num=8, seconds=60)
+    assert best.feasible.tolist() == [True]
+    assert torch.equal(best.x[0, [0, -1]], torch.stack([start, goal]))
+    # What it started from is the task's own.
+    raw = flow.to_workspace(flow.plan(start, goal, 3, descent=0).x)
+    ways = task.between(flow.to_workspace(torch.stack([start, goal])).expand(3, -1, -1), random_stream("plan", 0))
+    torch.testing.assert_close(raw.sort(dim=0).values, ways.sort(dim=0).values, rtol=0, atol=1e-6)
+
+
+def test_without_a_model_any_number_of_a_crowd_is_planned_for() -> None:
+    start, goal = Weave(6).scene(6, 0, 0)
+    assert DescentPlanner.of("weave").best_of(start, goal, num=4).x.shape == (1, 64, 12)
+
+
+def test_without_a_model_there_is_no_flow_to_guide() -> None:
+    flow = DescentPlanner.of("swap", correction__margin=0.05)
+    assert torch.equal(flow.plan(START, GOAL, 2).x, flow.plan(START, GOAL, 2, guidance="none").x)
+    with pytest.raises(PlanError, match="guidance=robot: expected all or none, without a model there is no flow"):
+        flow.plan(START, GOAL, 2, guidance="robot")
+    with pytest.raises(ConfigError, match=r"correction.margn: no such setting.*did you mean"):
+        DescentPlanner.of("swap", correction__margn=0.05)
+
+
+def test_the_command_plans_without_a_model(in_process: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = in_process("sample", "run=none", *PAIR, "num=5")
+    assert (code, err) == (0, "")
+    assert out.startswith("Task swap, without a model: 5 of 5 plans are feasible, 100.0% (95 % interval")
+    with np.load("plans.npz") as file:
+        assert np.array_equal(file["x"], DescentPlanner.of("swap").plan(START, GOAL, 5).x.numpy())

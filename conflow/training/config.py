@@ -38,7 +38,7 @@ SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
 
 OF_TASK = "task."
 """Begins the settings that are a task's own."""
-LATER: dict[str, Tree] = {"train": {"precision": "32"}, "sample": {"descent": 0}}
+LATER: dict[str, Tree] = {"data": {"unrepaired": 0.0}, "train": {"precision": "32"}, "sample": {"descent": 0}}
 """Settings that earlier runs lack, with their defaults: here, since a planner reads no YAML."""
 SIZES = (
     "data.num",
