@@ -264,8 +264,11 @@ class Planner:
         if not isinstance(self.model.task.robots, Crowd):
             return self
         D = _numbers("start", start, "numbers of shape (D,) or (B, D)").shape[-1:]
-        known = D in ((), (self.model.D,)) or D[0] < 4 or D[0] % 2
-        return self if known else type(self)(self.model.of_numbers(D[0]))
+        return self if D == () or D[0] < 4 or D[0] % 2 else self.of_numbers(D[0])
+
+    def of_numbers(self, D: int) -> "Planner":
+        """The planner for configurations of D numbers: this one, or of a crowd the same for as many robots."""
+        return self if D == self.model.D else type(self)(self.model.of_numbers(D))
 
     def _met(self, discs: Sequence[Obstacle]) -> dict[str, Constraint]:
         """What plans are judged by: all that training keeps, and obstacles."""

@@ -868,7 +868,11 @@ def test_a_plan_without_a_model_is_found_from_each_robots_own_way(task: SceneTas
 
 def test_without_a_model_any_number_of_a_crowd_is_planned_for() -> None:
     start, goal = Weave(6).scene(6, 0, 0)
-    assert DescentPlanner.of("weave").best_of(start, goal, num=4).x.shape == (1, 64, 12)
+    flow = DescentPlanner.of("weave")
+    best = flow.best_of(start, goal, num=4)
+    assert best.x.shape == (1, 64, 12)
+    figure = picture(flow, best)  # of six, not of the 28 that the task has by itself
+    assert len([line for line in figure.axes[0].lines if len(line.get_xdata()) == 64]) == 6  # type: ignore[arg-type]
 
 
 def test_without_a_model_there_is_no_flow_to_guide() -> None:

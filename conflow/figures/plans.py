@@ -27,6 +27,7 @@ def picture(planner: Planner, plans: Plans, obstacles: Sequence[Sequence[float]]
         plans: in the user's units.
         obstacles: discs (x, y, radius) in the same, beside those that the task always has.
     """
+    planner = planner.of_numbers(plans.x.shape[-1])
     title = f"{int(plans.feasible.sum())} of {len(plans.x)} plans are feasible"
     if isinstance(planner.model.task.robots, Arms):
         x = planner.to_workspace(plans.x)
