@@ -25,8 +25,9 @@ from conflow.planner import exact, looks
 from conflow.results import planbench as results
 from conflow.results.planbench import Record, Row, Settings
 from conflow.results.printing import checked_format
+from conflow.scene.constraint import Sum
 from conflow.scene.crowd import CrowdAvoidance
-from conflow.scene.measures import leaves_workspace, path_length, smoothness
+from conflow.scene.measures import keeps, leaves_workspace, path_length, smoothness
 from conflow.scene.settings import Box
 from conflow.scene.task import SceneTask
 from conflow.scene.tasks import CROWDS
@@ -264,8 +265,7 @@ def feasible(task: SceneTask, x: Tensor, ends: Tensor) -> Tensor:
 
 def kept(task: SceneTask, x: Tensor) -> Tensor:
     """Whether trajectories (batch, any T, D) keep all that the task asks for, and stay inside, boolean (batch,)."""
-    clearances = [one.swept_clearance(x).amin(dim=1) for one in task.constraints().values()]
-    return ~leaves_workspace(x) & (torch.stack(clearances).amin(dim=0) >= 0)
+    return ~leaves_workspace(x) & keeps(Sum([*task.constraints().values()]), x)
 
 
 @torch.no_grad()

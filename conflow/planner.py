@@ -491,7 +491,7 @@ def exact(source: Source, x: Tensor, y: Tensor) -> Tensor:
 def _ranked(x: Tensor, constraint: Constraint) -> Plans:
     """Trajectories x (B, num, T, D) judged and sorted."""
     flat, pairs = x.flatten(0, 1), x.shape[:2]
-    clearance = constraint.swept_clearance(flat).amin(dim=1).view(pairs)
+    clearance = constraint.closest(flat).view(pairs)
     feasible = (clearance >= 0) & ~leaves_workspace(flat).view(pairs)
     smooth = smoothness(constraint.robots, flat).view(pairs)
     order = smooth.argsort(dim=1, stable=True)

@@ -6,6 +6,7 @@
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from conflow.scene.arm_constraints import (
     FAR,
     FAR_FROM_ITSELF,
     ArmAvoidance,
+    Bounded,
     JointSpeed,
     NearestPair,
     SelfAvoidance,
@@ -24,7 +26,8 @@ from conflow.scene.arm_constraints import (
     Table,
 )
 from conflow.scene.arms import Arms, Base, Body, Chain
-from conflow.scene.constraint import Barrier, Constraint, RobotAvoidance, Workspace
+from conflow.scene.constraint import Barrier, Constraint, RobotAvoidance, Sum, Workspace
+from conflow.scene.measures import keeps
 from conflow.scene.panda import PANDA
 
 FACING = [Base(-0.35), Base(0.35, turn=math.pi)]
@@ -219,10 +222,44 @@ def test_the_swept_clearance_is_never_above_that_of_the_waypoints(build: Callabl
 
 
 @every
+@both
+def test_the_closest_approach_is_the_smallest_swept_clearance(
+    robots: Arms, build: Callable[[Arms], Constraint]
+) -> None:
+    """Found without looking everywhere: of what is known to be no smaller than something else nothing is said."""
+    constraint = build(robots)
+    waypoints = configurations(robots, batch=150, T=5)
+    x = torch.cat([waypoints, waypoints[:, :1] + 0.05 * (waypoints - waypoints[:, :1])])  # far apart, and near
+    swept = constraint.swept_clearance(x).amin(dim=1)
+    equal = partial(torch.testing.assert_close, rtol=0, atol=1e-12)  # float64 rounding
+    equal(constraint.closest(x), swept)
+    known = torch.linspace(-0.1, 0.2, len(x), dtype=x.dtype)
+    equal(constraint.closest(x, known), torch.minimum(swept, known))
+    narrowed, both = constraint.narrowed(0.03), Sum([constraint, Workspace(robots, 0.6)])
+    equal(narrowed.closest(x, known), torch.minimum(swept - 0.03, known))
+    equal(both.closest(x), both.swept_clearance(x).amin(dim=1))
+    assert keeps(constraint, x).equal(swept >= 0)
+
+
+@pytest.mark.parametrize("name", ["arms", "self", "spheres", "table"])
+@both
+def test_no_clearance_changes_faster_than_its_slope(robots: Arms, name: str) -> None:
+    constraint, x = CONSTRAINTS[name](robots), configurations(robots, batch=400)
+    assert isinstance(constraint, Bounded)
+    noise = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(1))
+    for size, joints in ((1e-3, 1.0), (0.1, 1.0), (0.1, (torch.rand(x.shape[2]) < 0.2).to(x))):
+        other = x + size * noise * joints
+        change = (other - x).abs() @ (constraint.slope * robots.scale)
+        assert bool(((constraint.clearance(other) - constraint.clearance(x)).abs() <= change + 1e-12).all())
+    assert bool((constraint.slope >= 0).all())
+
+
+@every
 def test_a_trajectory_that_is_not_finite_violates(build: Callable[[Arms], Constraint]) -> None:
     x = 0 * configurations(PANDAS, batch=3)
     x[1, 2, 3] = math.nan
     assert bool(build(PANDAS).violation(x)[1])
+    assert not keeps(build(PANDAS), x)[1]
 
 
 def test_an_arm_keeps_clear_of_itself_of_spheres_and_of_the_table() -> None:

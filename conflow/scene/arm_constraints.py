@@ -1,5 +1,6 @@
 """Constraints on arms: apart from each other, from themselves, from obstacles and the table, and not too fast."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -16,13 +17,64 @@ FAR, FAR_FROM_ITSELF = 0.2, 0.05
 """Metres beyond which gaps are not measured."""
 WAYPOINTS = 512
 """At which pairs of bodies are looked for at a time: what that takes stays in the cache."""
-ROWS = 128
-"""Trajectories that are swept at a time."""
+ROWS, HALVINGS = 128, 3
+"""Trajectories that are swept at a time, and how often what is between two waypoints is halved: into PARTS."""
 SEPARATE = 3
 """Links of an arm that are so far apart along it may touch; nearer ones are held apart by their joints' limits."""
 
 
-class NearestPair(Constraint):
+class Bounded(Constraint):
+    """A constraint on where bodies are, whose clearance changes by at most sum_j slope_j |dq_j| as joints turn by dq.
+
+    Attributes:
+        slope: in metres per radian, float64 (D,).
+    """
+
+    robots: Arms
+    slope: Tensor
+
+    def gaps(self, x: Tensor) -> Tensor:
+        """c as `closest` needs it, (batch, T): a constraint that does not measure far ones looks farther here."""
+        return self.clearance(x)
+
+    def swept_clearance(self, x: Tensor) -> Tensor:
+        # By subdividing, but few at a time: of a thousand all that it takes would be gigabytes.
+        return torch.cat([super(Bounded, self).swept_clearance(rows) for rows in x.split(ROWS)])
+
+    def closest(self, x: Tensor, known: Tensor | None = None) -> Tensor:
+        return torch.cat(
+            [
+                self._closest(rows, None if known is None else known[i : i + len(rows)])
+                for i, rows in zip(range(0, len(x), ROWS), x.split(ROWS), strict=True)
+            ]
+        )
+
+    def _closest(self, x: Tensor, known: Tensor | None) -> Tensor:
+        """By halving what is between two waypoints, as often as `swept_clearance` divides it, where it may matter.
+
+        From c and c' at its ends, which a gap on the way is at most `change` away from in sum, it is at least
+        (c + c' - change) / 2.
+        """
+        gaps = self.gaps(x)
+        found = gaps.amin(dim=1)
+        found = found if known is None else torch.minimum(found, known)
+        row = torch.arange(len(x)).repeat_interleave(x.shape[1] - 1)
+        p, q, c, c_ = (one.flatten(0, 1) for one in (x[:, :-1], x[:, 1:], gaps[:, :-1], gaps[:, 1:]))
+        change = (q - p).abs() @ (self.slope * self.robots.scale).to(x)
+        for _ in range(HALVINGS):
+            may = (c + c_ - change) / 2 < found[row]
+            row, p, q, c, c_, change = (one[may] for one in (row, p, q, c, c_, change))
+            if not len(row):
+                break
+            middle = (p + q) / 2
+            between = self.gaps(middle[None])[0]
+            found = found.scatter_reduce(0, row, between, "amin")
+            halves = (row, row), (p, middle), (middle, q), (c, between), (between, c_), (change / 2, change / 2)
+            row, p, q, c, c_, change = map(torch.cat, halves)
+        return found
+
+
+class NearestPair(Bounded):
     """Parts of arms keep apart: c is the gap between the nearest spheres of any two of them, |p - q| - r - r'.
 
     Gaps beyond `far` are not measured, and count as that. Of all pairs of spheres few are looked at: a ball around each
@@ -35,8 +87,6 @@ class NearestPair(Constraint):
         apart: whether two of them, (arm, body, arm, body), have to keep apart.
         far: in metres.
     """
-
-    robots: Arms
 
     def __init__(
         self,
@@ -62,6 +112,13 @@ class NearestPair(Constraint):
         self.i, self.j = kept.any(dim=1).nonzero()[:, 0], kept.any(dim=0).nonzero()[:, 0]
         # What need not keep apart is as good as infinitely far.
         self.reach = (reach[:, None] + reach).where(kept, -torch.inf)[self.i][:, self.j]
+        # A joint that moves both of two parts as one does not change their gap.
+        lever = robots.levers(
+            self.arm.repeat_interleave(PART), self.link.repeat_interleave(PART), spheres[..., :3].flatten(0, 1)
+        )
+        lever = lever.unflatten(1, (-1, PART)).amax(dim=2)
+        one_alone = (lever[:, :, None] > 0) ^ (lever[:, None] > 0)
+        self.slope = (torch.maximum(lever[:, :, None], lever[:, None]) * (one_alone & kept)).amax(dim=(1, 2))
         self._last: Last[Contact] = Last()
 
     def clearance(self, x: Tensor) -> Tensor:
@@ -79,9 +136,16 @@ class NearestPair(Constraint):
 
         return near.c.view(*x.shape[:2], 1), pullback
 
-    def swept_clearance(self, x: Tensor) -> Tensor:
-        # By subdividing, but few at a time: of a thousand all that it takes would be gigabytes.
-        return torch.cat([super(NearestPair, self).swept_clearance(rows) for rows in x.split(ROWS)])
+    def gaps(self, x: Tensor) -> Tensor:
+        if self.far >= FAR:
+            return self.clearance(x)
+        farther = copy.copy(self)
+        farther.far, farther._last = FAR, Last()
+        return farther.clearance(x)
+
+    def _closest(self, x: Tensor, known: Tensor | None) -> Tensor:
+        far = x.new_full(x.shape[:1], self.far)
+        return super()._closest(x, far if known is None else known.clamp(max=self.far))
 
     def _nearest(self, x: Tensor) -> "Contact":
         return self._last.of(x, self._found)
@@ -231,18 +295,17 @@ class SphereAvoidance(NearestPair):
         super().__init__(robots, [*moving, *standing], _in_the_way)
 
 
-class Table(Constraint):
+class Table(Bounded):
     """Nothing that its first joint lifts touches the table the arms stand on: c is the smallest z - r of a sphere.
 
     What is before the second joint turns about the vertical, and stays as high as it is.
     """
 
-    robots: Arms
-
     def __init__(self, robots: Arms, height: float = 0.0) -> None:
         super().__init__(robots)
         self.height = height
         self.lifted = (robots.link > 1).nonzero()[:, 0]
+        self.slope = robots.levers(robots.owner, robots.link, robots.local)[:, self.lifted].amax(dim=1)
 
     def clearance(self, x: Tensor) -> Tensor:
         return self._gaps(x).amin(dim=0).view(x.shape[:2])
@@ -259,9 +322,6 @@ class Table(Constraint):
             return robots.pull(x, robots.owner[body], robots.link[body], torch.einsum("nk,nkc->nc", local, on), up)
 
         return c.view(*x.shape[:2], 1), pullback
-
-    def swept_clearance(self, x: Tensor) -> Tensor:
-        return torch.cat([super(Table, self).swept_clearance(rows) for rows in x.split(ROWS)])
 
     def _gaps(self, x: Tensor) -> Tensor:
         """z - r of every sphere, (spheres, batch T)."""

@@ -209,6 +209,17 @@ class Arms(Robots):
         """dC/dx (batch, T, D) of dC/dq (arms, joints, batch T)."""
         return (self.scale.to(x) * torque[self._arm, self._joint].mT).unflatten(0, x.shape[:2])
 
+    def levers(self, arm: Tensor, link: Tensor, local: Tensor) -> Tensor:
+        """How far points of links are from the axes of the joints that move them, at most, and 0 from others, (D, n).
+
+        The sum of lengths along the chain, from a joint's origin to a point at `local`, (n, 3) in metres, on a link of
+        an arm, `link` and `arm` (n,): whatever the joints' angles are.
+        """
+        a, _, d = self._dh
+        along = F.pad((a.square() + d.square()).sqrt().cumsum(dim=1), (1, 0))  # to each link's origin, (arms, links)
+        lever = along[arm, link] + torch.linalg.vector_norm(local, dim=1) - along[self._arm, self._joint + 1][:, None]
+        return lever * ((self._arm[:, None] == arm) & (self._joint[:, None] < link))
+
     def seen_from_base(self, sphere: Sphere) -> Sphere:
         """A sphere that stands in the workspace, in the frame of the first arm's base."""
         x, y, z, radius = sphere

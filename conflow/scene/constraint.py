@@ -86,7 +86,8 @@ class Constraint(nn.Module, ABC):
     """What trajectories x (batch, T, D) of some robots must keep: `clearance` says by how much they do.
 
     The rest follows from it. Where a constraint knows a closed form it overrides: several `clearances` a waypoint in
-    place of the smallest, their `vjp` in place of automatic differentiation, `swept_clearance` in place of subdivision.
+    place of the smallest, their `vjp` in place of automatic differentiation, `swept_clearance` in place of subdivision,
+    `closest` where it knows between which waypoints it need not look.
 
     Attributes:
         robots: what moves.
@@ -124,6 +125,15 @@ class Constraint(nn.Module, ABC):
         on_the_way = self.clearance(torch.cat([between, x[:, -1:]], dim=1)).unfold(1, PARTS + 1, PARTS).amin(dim=2)
         # A clearance of steps between waypoints, such as a speed's, is larger of smaller steps.
         return torch.minimum(on_the_way, torch.minimum(c[:, :-1], c[:, 1:]))
+
+    def closest(self, x: Tensor, known: Tensor | None = None) -> Tensor:
+        """The smallest c on the way of each trajectory, that of `swept_clearance`, (batch,).
+
+        Where something else is known to be as small as `known` (batch,), the smaller of the two: so what cannot be
+        below that need not be looked at.
+        """
+        c = self.swept_clearance(x).amin(dim=1)
+        return c if known is None else torch.minimum(c, known)
 
     def barrier(self, x: Tensor) -> Tensor:
         """C(x), (batch,): about 0 where feasible, negative where not."""
@@ -179,6 +189,9 @@ class Narrowed(Constraint):
     def swept_clearance(self, x: Tensor) -> Tensor:
         return self.constraint.swept_clearance(x) - self.margin
 
+    def closest(self, x: Tensor, known: Tensor | None = None) -> Tensor:
+        return self.constraint.closest(x, None if known is None else known + self.margin) - self.margin
+
 
 class Sum(Constraint):
     """Several constraints at once: barriers add up, the clearance is the smallest."""
@@ -195,6 +208,12 @@ class Sum(Constraint):
 
     def swept_clearance(self, x: Tensor) -> Tensor:
         return torch.stack([term.swept_clearance(x) for term in self.terms]).amin(dim=0)
+
+    def closest(self, x: Tensor, known: Tensor | None = None) -> Tensor:
+        for term in self.terms:
+            known = term.closest(x, known)
+        assert known is not None  # there is a term
+        return known
 
     def barrier(self, x: Tensor) -> Tensor:
         return reduce(add, (term.barrier(x) for term in self.terms))

@@ -47,7 +47,7 @@ def leaves_workspace(x: Tensor) -> Tensor:
 
 def keeps(constraint: Constraint, x: Tensor) -> Tensor:
     """Whether x keeps a constraint on the straight lines between its waypoints too, boolean (batch,)."""
-    return constraint.swept_clearance(x).amin(dim=1) >= 0
+    return constraint.closest(x, x.new_zeros(len(x))) >= 0
 
 
 def endpoint_error(robots: Robots, x: Tensor, x_1: Tensor, waypoint: int) -> Tensor:
