@@ -1,5 +1,6 @@
 import math
 from collections.abc import Callable
+from math import pi
 from statistics import fmean, stdev
 
 import pytest
@@ -7,8 +8,19 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from conflow.scene.arms import Arms, Base, Body, Chain
 from conflow.scene.constraint import SpeedLimit, Sum, Workspace
-from conflow.scene.measures import endpoint_error, path_length, peak_acceleration, smoothness, squared_acceleration
+from conflow.scene.measures import (
+    collision_intensity,
+    endpoint_error,
+    hand_path_length,
+    joint_path_length,
+    joint_smoothness,
+    path_length,
+    peak_acceleration,
+    smoothness,
+    squared_acceleration,
+)
 from conflow.scene.robots import Discs
 from conflow.scene.settings import Obstacle
 from conflow.scene.tasks.swap import swap
@@ -18,9 +30,9 @@ from conflow.training.metrics import (
     Diversity,
     EndpointError,
     EnergyDistance,
+    Median,
     NearRate,
     OutsideRate,
-    PathLength,
     Smoothness,
     SuccessRate,
     SweptCollisionRate,
@@ -92,7 +104,7 @@ def test_the_obstacle_between_two_waypoints_is_a_swept_collision_alone() -> None
     x[0, :, 1] = 0.4  # past (0, 0.5) in the middle of a step
     metrics = trajectory_metrics({"robot": ROBOTS, "object": OBSTACLE}, ROBOTS, None, ROBOTS)
     metrics.update(x=x.repeat(2, 1, 1), x_1=x.repeat(2, 1, 1))
-    found = {key: value for key, value in metrics.compute().items() if "collision" in key}
+    found = {key: value for key, value in metrics.compute().items() if "_collision" in key}
     names = [f"{one}_collision{swept}" for one in ("robot", "object") for swept in ("", "_swept")]
     assert found.keys() == {f"{name}_{part}" for name in names for part in ("rate", "low", "high", "count")}
     assert [found[f"{name}_count"] for name in names] == [0, 0, 0, 2]
@@ -133,6 +145,42 @@ def test_a_single_kink_shows_in_full_in_the_peak_and_diluted_in_the_mean() -> No
     assert squared_acceleration(TWO, x).item() == pytest.approx(1 / 8)
 
 
+def test_joints_that_turn_at_constant_speed_are_smooth_and_hands_go_along_arcs() -> None:
+    """Two arms of one link of a metre: the first turns by a right angle, the second stands still."""
+    link = Chain(((0, 0, 0),), (-pi,), (pi,), (2.0,), [Body(1, [(1, 0, 0, 0.05)])], hand=(1.0, 0.0, 0.0))
+    arms, T = Arms([link, link], [Base(-2), Base(2)], axes=2), 50
+    x = torch.zeros(1, T, 2)
+    x[0, :, 0] = torch.linspace(0, 0.5, T)  # of a range of pi
+    assert joint_smoothness(arms, x).item() == pytest.approx(0, abs=1e-6)
+    assert joint_path_length(arms, x).item() == pytest.approx(pi / 2)
+    assert hand_path_length(arms, x).item() == pytest.approx(pi / 4, rel=1e-4)  # the mean of an arc and of nothing
+    x[0, :, 1] = 0.01 * torch.arange(T) ** 2 / T
+    assert joint_smoothness(arms, x).item() == pytest.approx(0.02 * pi / T, rel=1e-4)
+    found = {}
+    for robots in (arms, TWO):
+        kept = Workspace(robots)
+        metrics = trajectory_metrics({"limits": kept}, kept, None, kept)
+        some = torch.zeros(3, T, robots.D)
+        metrics.update(x=some, x_1=some)
+        found[robots] = metrics.compute()
+    assert {key for key in found[arms] if key.endswith("_median")} - found[TWO].keys() == {
+        *("joint_smoothness_median", "joint_path_length_median", "hand_path_length_median")
+    }
+
+
+def test_collision_intensity_is_the_share_of_waypoints_in_violation() -> None:
+    x = parallel(0.4).repeat(3, 1, 1)
+    x[0, :2, 3] = x[0, :2, 1]  # two of five waypoints on top of each other
+    x[1, 4] = math.nan
+    assert collision_intensity(ROBOTS, x).tolist() == pytest.approx([2 / 5, 1 / 5, 0])
+    metrics = trajectory_metrics({"robot": ROBOTS}, ROBOTS, None, ROBOTS)
+    metrics.update(x=x[[0, 2, 2]], x_1=x[[0, 2, 2]])
+    found = metrics.compute()
+    # 2/5, 0, 0: the mean is 2/15 and the standard deviation 2 / (5 sqrt 3), over sqrt 3.
+    assert found["collision_intensity"] == pytest.approx(2 / 15)
+    assert found["collision_intensity_high"] - found["collision_intensity"] == pytest.approx(1.959964 * 2 / 15)
+
+
 def test_endpoint_errors_are_distances_per_robot() -> None:
     x_1 = parallel(0.4)
     x = x_1.clone()
@@ -161,7 +209,7 @@ def test_path_lengths_of_a_straight_line_a_half_circle_and_a_robot_that_stands_s
     chords = (T - 1) * math.sin(math.pi / 2 / (T - 1))
     assert path_length(TWO, x).item() == pytest.approx(chords / 2, rel=1e-5)
     assert path_length(TWO, x).item() == pytest.approx(math.pi / 4, rel=1e-3)
-    metric = PathLength(TWO)
+    metric = Median(TWO, "path_length", path_length)
     metric.update(torch.cat([x, parallel(0.4, T), x]))
     result = metric.compute()
     assert result["path_length_median"] == pytest.approx(chords / 2, rel=1e-5)

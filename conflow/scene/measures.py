@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from conflow.scene.arms import Arms
 from conflow.scene.constraint import Constraint
 from conflow.scene.robots import Robots
 
@@ -34,6 +35,26 @@ def squared_acceleration(robots: Robots, x: Tensor) -> Tensor:
 def path_length(robots: Robots, x: Tensor) -> Tensor:
     """Mean over bodies of the length of the path, sum_i |p_{i+1} - p_i| in workspace units, (batch,)."""
     return torch.linalg.vector_norm(robots.points(x).diff(dim=1), dim=3).sum(dim=1).mean(dim=1)
+
+
+def hand_path_length(arms: Arms, x: Tensor) -> Tensor:
+    """Mean over arms of the length of their hands' paths, in metres, (batch,)."""
+    return torch.linalg.vector_norm(arms.hands(x).diff(dim=1), dim=3).sum(dim=1).mean(dim=1)
+
+
+def joint_path_length(arms: Arms, x: Tensor) -> Tensor:
+    """The length of the path of all joints together, sum_i |q_{i+1} - q_i| in radians, (batch,)."""
+    return torch.linalg.vector_norm(arms.joints(x).diff(dim=1), dim=2).sum(dim=1)
+
+
+def joint_smoothness(arms: Arms, x: Tensor) -> Tensor:
+    """As `smoothness`, of all joints together: the mean of |q_{i+1} - 2 q_i + q_{i-1}| in radians, (batch,)."""
+    return torch.linalg.vector_norm(arms.joints(x).diff(n=2, dim=1), dim=2).mean(dim=1)
+
+
+def collision_intensity(constraint: Constraint, x: Tensor) -> Tensor:
+    """The share of waypoints in violation, (batch,)."""
+    return 1 - (constraint.clearance(x) >= 0).to(x.dtype).mean(dim=1)
 
 
 def leaves_workspace(x: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ States are counts, sums or the values themselves, so batches of any size add up 
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from scipy import stats
@@ -13,9 +14,14 @@ from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.utilities import dim_zero_cat
 
+from conflow.scene.arms import Arms
 from conflow.scene.constraint import Constraint
 from conflow.scene.measures import (
+    collision_intensity,
     endpoint_error,
+    hand_path_length,
+    joint_path_length,
+    joint_smoothness,
     keeps,
     leaves_workspace,
     path_length,
@@ -31,6 +37,8 @@ BERTH = 0.1
 """Robots that come nearer to touching than this, in workspace units, count as near."""
 REACHED = 0.01
 """Starts and goals count as reached within this `endpoint_error`, in workspace units per robot."""
+OF_ARMS = (joint_smoothness, joint_path_length, hand_path_length)
+"""What is measured of arms besides, under their names."""
 BLOCK = 1024
 """Rows and columns of the distances held at a time: 8 MB, where all of 10,000 trajectories would take 800 MB."""
 
@@ -217,6 +225,12 @@ class _Values(Metric):
             result |= {name: float(values.quantile(q)), f"{name}_low": low, f"{name}_high": high}
         return result
 
+    def mean(self, name: str) -> dict[str, float]:
+        """The mean under this name, with its normal interval."""
+        values = dim_zero_cat(self.values).cpu().double()
+        mean, spread = float(values.mean()), Z * float(values.std()) / math.sqrt(len(values))
+        return {name: mean, f"{name}_low": mean - spread, f"{name}_high": mean + spread}
+
 
 class Smoothness(_Values):
     """Median and 95th percentile of `smoothness`, or of another reading of it, with intervals of order statistics."""
@@ -234,18 +248,35 @@ class Smoothness(_Values):
         return self.quantiles({f"{self.name}_median": 0.5, f"{self.name}_p95": 0.95})
 
 
-class PathLength(_Values):
-    """Median of `path_length`, with the interval of order statistics: what stands still or wanders shows here."""
+class Median(_Values):
+    """Median of a measure of trajectories, with the interval of order statistics.
 
-    def __init__(self, robots: Robots) -> None:
+    Of `path_length`: what stands still or wanders shows there.
+    """
+
+    def __init__(self, robots: Robots, name: str, measure: Callable[[Any, Tensor], Tensor]) -> None:
         super().__init__()
-        self.robots = robots
+        self.robots, self.name, self.measure = robots, name, measure
 
     def update(self, x: Tensor) -> None:
-        self.values.append(path_length(self.robots, x))
+        self.values.append(self.measure(self.robots, x))
 
     def compute(self) -> dict[str, float]:
-        return self.quantiles({"path_length_median": 0.5})
+        return self.quantiles({f"{self.name}_median": 0.5})
+
+
+class CollisionIntensity(_Values):
+    """Mean over trajectories of `collision_intensity`, with the normal interval of a mean."""
+
+    def __init__(self, constraint: Constraint) -> None:
+        super().__init__()
+        self.constraint = constraint
+
+    def update(self, x: Tensor) -> None:
+        self.values.append(collision_intensity(self.constraint, x))
+
+    def compute(self) -> dict[str, float]:
+        return self.mean("collision_intensity")
 
 
 class EndpointError(_Values):
@@ -265,9 +296,7 @@ class EndpointError(_Values):
         self.values.append(endpoint_error(self.robots, x, x_1, self.waypoint))
 
     def compute(self) -> dict[str, float]:
-        values = dim_zero_cat(self.values).cpu().double()
-        mean, spread = float(values.mean()), Z * float(values.std()) / math.sqrt(len(values))
-        return {self.name: mean, f"{self.name}_low": mean - spread, f"{self.name}_high": mean + spread}
+        return self.mean(self.name)
 
 
 class Diversity(_Values):
@@ -367,9 +396,12 @@ def trajectory_metrics(
         # What the paper calls smoothness it does not say; these are other readings, under their own names.
         "peak_acceleration": Smoothness(robots, "peak_acceleration", peak_acceleration),
         "squared_acceleration": Smoothness(robots, "squared_acceleration", squared_acceleration),
-        "path_length": PathLength(robots),
+        "path_length": Median(robots, "path_length", path_length),
+        "collision_intensity": CollisionIntensity(trained),
         "start_error": EndpointError(robots, "start_error", 0),
         "end_error": EndpointError(robots, "end_error", -1),
         "distances": Diversity() if reference is None else DiversityAndEnergyDistance(reference),
     }
+    if isinstance(robots, Arms):
+        metrics |= {measure.__name__: Median(robots, measure.__name__, measure) for measure in OF_ARMS}
     return MetricCollection(metrics, compute_groups=False)

@@ -7,6 +7,7 @@ from conflow.training.evaluation import Evaluation, Metrics, latency_batch
 ROWS = {
     "success_rate": "success rate",
     "outside_rate": "rate of leaving the workspace",
+    "collision_intensity": "share of waypoints in violation",
     "energy_distance": "energy distance to held-out D+",
     "smoothness_median": "smoothness, median",
     "smoothness_p95": "smoothness, 95th percentile",
@@ -14,6 +15,11 @@ ROWS = {
     "start_error": "start error per robot",
     "end_error": "end error per robot",
     "diversity": "diversity",
+}
+OF_ARMS = {
+    "joint_smoothness_median": "smoothness of joints, median",
+    "joint_path_length_median": "path length of joints, median",
+    "hand_path_length_median": "path length per hand, median",
 }
 
 
@@ -25,7 +31,9 @@ def results_table(evaluation: Evaluation, title: str) -> Table:
     made.add_column("metric")
     for setting in results:
         made.add_column(setting, justify="right")
-    for key, label in (_collisions(next(iter(results.values()))) | ROWS).items():
+    of_first = next(iter(results.values()))
+    of_arms = {key: label for key, label in OF_ARMS.items() if key in of_first}
+    for key, label in (_collisions(of_first) | ROWS | of_arms).items():
         made.add_row(label, *(_result(metrics, key) for metrics in results.values()))
     made.add_row(f"ms for a batch of {batch}", *(f"{metrics['latency_ms']:.0f}" for metrics in results.values()))
     return made
