@@ -69,7 +69,7 @@ compare: .venv/installed  ## Print the paper's tables and claims: TASK= PRESET= 
 reference: .venv/installed  ## Publish the numbers of finished runs as files in runs/reference/runs/: PRESET=
 	@$(CONFLOW) reference preset=$(PRESET)
 
-sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN= (none: without a model for TASK) SEED= ARGS="obstacle=x,y,r via=s,x1,y1,..."
+sample: .venv/installed  ## Plan from START="x1,y1,x2,y2" to GOAL= and draw it: OUT= NUM= RUN=latest, or none (no model) for TASK, SEED= ARGS="obstacle=x,y,r via=s,x1,y1,..."
 	@$(CONFLOW) sample $(if $(filter none,$(RUN)),task=$(TASK),$(OWN)) run=$(RUN) start="$(START)" goal="$(GOAL)" $(WRITTEN) seed=$(SEED) $(ARGS)
 
 figures: .venv/installed  ## Draw the pictures of finished runs into runs/figures/: RUN=latest, or RUN=NAME,NAME,... SPLIT=

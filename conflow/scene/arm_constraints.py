@@ -58,7 +58,7 @@ class Bounded(Constraint):
         gaps = self.gaps(x)
         found = gaps.amin(dim=1)
         found = found if known is None else torch.minimum(found, known)
-        row = torch.arange(len(x)).repeat_interleave(x.shape[1] - 1)
+        row = torch.arange(len(x), device=x.device).repeat_interleave(x.shape[1] - 1)
         p, q, c, c_ = (one.flatten(0, 1) for one in (x[:, :-1], x[:, 1:], gaps[:, :-1], gaps[:, 1:]))
         change = (q - p).abs() @ (self.slope * self.robots.scale).to(x)
         for _ in range(HALVINGS):
