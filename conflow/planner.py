@@ -452,7 +452,17 @@ class DescentPlanner(Planner):
         task = self.model.task
         return task.between(y[:, [0, -1]], noise) if isinstance(task, SceneTask) else source.sample(y, noise)
 
-    def _field(self, ends: Tensor, guidance: str | None, *more: Any) -> Field:
+    def _field(
+        self,
+        ends: Tensor,
+        guidance: str | None,
+        obstacles: Sequence[Obstacle],
+        robot_weight: float | None,
+        obstacle_weight: float | None,
+    ) -> Field:
+        for name, weight in {"robot_weight": robot_weight, "obstacle_weight": obstacle_weight}.items():
+            if weight is not None:
+                raise PlanError(f"{name}={brief(weight)}: expected none, without a model there is no flow to guide")
         if guidance not in (ALL, NONE, None):
             raise PlanError(
                 f"guidance={brief(guidance)}: expected all or none, without a model there is no flow to guide"

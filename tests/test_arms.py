@@ -241,13 +241,27 @@ def test_the_closest_approach_is_the_smallest_swept_clearance(
     assert keeps(constraint, x).equal(swept >= 0)
 
 
+def test_what_cannot_be_the_closest_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    constraint, x, looked = ArmAvoidance(PANDAS), configurations(PANDAS, batch=20), list[int]()
+    gaps = ArmAvoidance.gaps
+
+    def counted(self: ArmAvoidance, x: Tensor) -> Tensor:
+        looked.append(x.shape[0] * x.shape[1])
+        return gaps(self, x)
+
+    monkeypatch.setattr(ArmAvoidance, "gaps", counted)
+    constraint.closest(x, x.new_full((20,), -10.0))
+    assert looked == [20 * 6]  # waypoints alone
+
+
 @pytest.mark.parametrize("name", ["arms", "self", "spheres", "table"])
 @both
 def test_no_clearance_changes_faster_than_its_slope(robots: Arms, name: str) -> None:
     constraint, x = CONSTRAINTS[name](robots), configurations(robots, batch=400)
     assert isinstance(constraint, Bounded)
-    noise = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(1))
-    for size, joints in ((1e-3, 1.0), (0.1, 1.0), (0.1, (torch.rand(x.shape[2]) < 0.2).to(x))):
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(x.shape, dtype=x.dtype, generator=generator)
+    for size, joints in ((1e-3, 1.0), (0.1, 1.0), (0.1, (torch.rand(x.shape[2], generator=generator) < 0.2).to(x))):
         other = x + size * noise * joints
         change = (other - x).abs() @ (constraint.slope * robots.scale)
         assert bool(((constraint.clearance(other) - constraint.clearance(x)).abs() <= change + 1e-12).all())

@@ -880,6 +880,8 @@ def test_without_a_model_there_is_no_flow_to_guide() -> None:
     assert torch.equal(flow.plan(START, GOAL, 2).x, flow.plan(START, GOAL, 2, guidance="none").x)
     with pytest.raises(PlanError, match="guidance=robot: expected all or none, without a model there is no flow"):
         flow.plan(START, GOAL, 2, guidance="robot")
+    with pytest.raises(PlanError, match="robot_weight=3: expected none, without a model there is no flow"):
+        flow.plan(START, GOAL, 2, robot_weight=3)
     with pytest.raises(ConfigError, match=r"correction.margn: no such setting.*did you mean"):
         DescentPlanner.of("swap", correction__margn=0.05)
 

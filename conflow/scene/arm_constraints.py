@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from conflow.scene.arms import Arms, Body, Last, Sphere
-from conflow.scene.constraint import SHARED, Constraint, Pullback
+from conflow.scene.constraint import PARTS, SHARED, Constraint, Pullback
 
 PART = 4
 """Spheres of a body that are looked at together, at most."""
@@ -17,7 +17,7 @@ FAR, FAR_FROM_ITSELF = 0.2, 0.05
 """Metres beyond which gaps are not measured."""
 WAYPOINTS = 512
 """At which pairs of bodies are looked for at a time: what that takes stays in the cache."""
-ROWS, HALVINGS = 128, 3
+ROWS, HALVINGS = 128, PARTS.bit_length() - 1
 """Trajectories that are swept at a time, and how often what is between two waypoints is halved: into PARTS."""
 SEPARATE = 3
 """Links of an arm that are so far apart along it may touch; nearer ones are held apart by their joints' limits."""
