@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from statistics import mean, median
 
-import numpy as np
 import torch
 from rich.console import Console
 from torch import Tensor
@@ -21,6 +21,7 @@ from torch import Tensor
 from conflow import commandline
 from conflow.errors import ConfigError
 from conflow.figures.planbench import animation, success
+from conflow.orca import Crossing, Simulator
 from conflow.planner import exact, looks
 from conflow.results import planbench as results
 from conflow.results.planbench import Record, Row, Settings
@@ -28,7 +29,6 @@ from conflow.results.printing import checked_format
 from conflow.scene.constraint import Sum
 from conflow.scene.crowd import CrowdAvoidance
 from conflow.scene.measures import keeps, leaves_workspace, path_length, smoothness
-from conflow.scene.settings import Box
 from conflow.scene.task import SceneTask
 from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import CrowdTask
@@ -45,12 +45,6 @@ ENDS = 1e-5
 """Within this of its start and goal, in workspace units, a plan reaches them."""
 ADHERENCE = 0.1
 """A waypoint this near to the straight line, as a share of its length, keeps to it (MMD's measure for empty maps)."""
-GOAL = 0.05
-"""Within this of their goals robots have arrived, in simulations (as published)."""
-ORCA_STEP, ORCA_SPEED, ORCA_JITTER = 0.05, 0.6, 1e-3
-"""Seconds of a simulated step; the top speed, that of demonstrations; and how much of it is chance."""
-CORNER = 4
-"""Corners of the polygon that a rounded corner becomes."""
 AT_MOST = 2000
 """Single robots' trajectories that the energy distance is taken of."""
 
@@ -125,66 +119,28 @@ def descending_from(propose: Propose, config: Config, settings: Settings) -> Sol
 
 
 def orca(settings: Settings) -> Method:
-    """Reciprocal collision avoidance, step by step, by `pyrvo`; goals count as reached within GOAL.
-
-    In exactly symmetric scenes it deadlocks, so preferred velocities are jittered; another try follows a failed one.
-    It goes straight for the goal, and around what is in the way no farther than it sees.
+    """Reciprocal collision avoidance: another try follows a failed one, until the time is over.
 
     Raises:
-        ModuleNotFoundError: it is not installed.
+        ModuleNotFoundError: `pyrvo` is not installed.
     """
-    import pyrvo
-
-    def walk(task: CrowdTask, scene: Tensor, draw: np.random.Generator) -> Tensor | None:
-        count, radius = task.robots.count, task.robots.radius
-        start, goal = scene.unflatten(1, (-1, 2)).double().numpy()
-        # Half a percent more than the radius, since it lets discs touch.
-        simulator = pyrvo.RVOSimulator(ORCA_STEP, 1.0, count, 2.0, 2.0, 1.005 * radius, ORCA_SPEED)
-        for place in start.tolist():
-            simulator.add_agent(place)
-        for box in task.boxes():
-            simulator.add_obstacle(_outline(box))
-        simulator.process_obstacles()
-        at, path = start, [start]
-        for _ in range(round(2 * task.seconds / ORCA_STEP)):
-            wanted = (goal - at) / ORCA_STEP
-            speed = np.linalg.norm(wanted, axis=1, keepdims=True)
-            wanted *= np.minimum(1, ORCA_SPEED / np.maximum(speed, 1e-9))
-            wanted += ORCA_JITTER * draw.standard_normal(wanted.shape)
-            for k, velocity in enumerate(wanted.tolist()):
-                simulator.set_agent_pref_velocity(k, velocity)
-            simulator.do_step()
-            at = np.array([simulator.get_agent_position(k).to_tuple() for k in range(count)])
-            path.append(at)
-            if np.linalg.norm(goal - at, axis=1).max() <= GOAL:
-                return torch.from_numpy(np.stack(path)).flatten(1).float()
-        return None
+    simulate = Simulator()
 
     def solve(task: SceneTask, scene: Tensor, seed: int) -> tuple[Tensor | None, float]:
         assert isinstance(task, CrowdTask)
-        began, draw = time.perf_counter(), np.random.default_rng(seed)
-        while True:
-            x = walk(task, scene, draw)
-            seconds = time.perf_counter() - began
+        start, goal = scene.unflatten(1, (-1, 2)).double().numpy()
+        began = time.perf_counter()
+        for attempt in count():
+            left = settings.limit - (time.perf_counter() - began)
+            if left <= 0:
+                break
+            path = simulate(Crossing(start, goal, task.robots.radius, task.boxes(), (seed, attempt)), left)
+            x = None if path is None else torch.from_numpy(path).flatten(1).float()
             if x is not None and bool(kept(task, x[None])):
-                return x, seconds
-            if seconds > settings.limit:
-                return None, seconds
+                return x, time.perf_counter() - began
+        return None, time.perf_counter() - began
 
     return Method("ORCA (pyrvo)", solve)
-
-
-def _outline(box: Box) -> list[list[float]]:
-    """A rounded box as a polygon around it, counterclockwise."""
-    angles = np.pi / 2 * (np.arange(CORNER) + 0.5) / CORNER
-    # As far out as keeps the edges between two corners of an arc outside it.
-    reach = box.rounding / np.cos(np.pi / 4 / CORNER)
-    points = []
-    for quarter, (sign_x, sign_y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
-        middle = [box.x + sign_x * (box.width / 2 - box.rounding), box.y + sign_y * (box.height / 2 - box.rounding)]
-        turned = angles + quarter * np.pi / 2
-        points += (np.array(middle) + reach * np.stack([np.cos(turned), np.sin(turned)], axis=1)).tolist()
-    return points
 
 
 def run(
