@@ -49,6 +49,13 @@ def test_a_crowd_avoids_itself_as_any_robots_do(count: int, shape: str) -> None:
     close(ours.clearances(x)[..., sorting], general.clearances(x))
 
 
+def test_a_gradient_in_pieces_is_that_of_each_trajectory() -> None:
+    x = trajectories(14, num=150)  # 91 pairs: three pieces, the last one smaller
+    ours = CrowdAvoidance(Crowd(14, 0.1)).shaped(Barrier(pairs="all"))
+    torch.testing.assert_close(ours.gradient(x), torch.cat([ours.gradient(one) for one in x.split(1)]))
+    assert ours.gradient(x[:0]).shape == (0, 9, 28)
+
+
 def test_barrier_and_gradient_are_those_that_are_computed_apart() -> None:
     x = trajectories(4)
     walls_too = CrowdAvoidance(Crowd(4, 0.1)).shaped(Barrier(pairs="all"))

@@ -10,6 +10,9 @@ from conflow.scene.constraint import Constraint, PairAvoidance, Pullback
 from conflow.scene.robots import Crowd
 from conflow.scene.settings import Box
 
+TOGETHER = 6000
+"""Pairs of discs, of all trajectories together, whose gradients are computed at a time."""
+
 
 class CrowdAvoidance(PairAvoidance):
     """No disc of a crowd touches another: c_ij = |p_i - p_j| - 2 r, one clearance for every pair.
@@ -47,6 +50,12 @@ class CrowdAvoidance(PairAvoidance):
 
     def gaps(self, d: Tensor) -> Tensor:
         return d - (2 * self.robots.radius + self.margin)
+
+    def gradient(self, x: Tensor) -> Tensor:
+        # In pieces that a processor's cache holds; each step on the whole would ask the system for memory anew.
+        gradient, count = super().gradient, x.shape[2] // 2
+        rows = max(1, TOGETHER // max(1, count * (count - 1) // 2))
+        return torch.cat([gradient(piece) for piece in x.split(rows)])
 
     def narrowed(self, margin: float) -> Constraint:
         made = CrowdAvoidance(self.robots, self.margin + margin)
