@@ -24,7 +24,7 @@ from torch import Tensor
 
 from conflow.errors import ConfigError, brief, nearest
 from conflow.flow.correction import Correction, descend, descent
-from conflow.flow.sampler import Field, in_pieces, integrate
+from conflow.flow.sampler import in_pieces, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, Sum
 from conflow.scene.demonstrations import Demonstrations
@@ -196,13 +196,7 @@ class Planner:
         y = torch.stack([start, *(point.expand_as(start) for point in points.values()), goal], dim=-2)
         y = y.reshape(-1, *y.shape[-2:])
         self._check_memory(num, len(y))
-        sample = self.model.config.sample
-
-        def arrive(x_0: Tensor, ends: Tensor) -> Tensor:
-            v = self._field(ends, guidance, discs, robot_weight, obstacle_weight)
-            return integrate(v, x_0, sample.steps, sample.solver)
-
-        index = (0, *points, -1)
+        arrive, index = self._flow(guidance, discs, robot_weight, obstacle_weight), (0, *points, -1)
         x = self._candidates(arrive, self._inside(y), index, num, seed)
         if steps:
             u_c = self._descending(discs, index)
@@ -362,15 +356,14 @@ class Planner:
         except ConfigError as error:
             raise PlanError(str(error)) from None
 
-    def _field(
+    def _flow(
         self,
-        ends: Tensor,
         guidance: str | None,
         obstacles: Sequence[Obstacle],
         robot_weight: float | None,
         obstacle_weight: float | None,
-    ) -> Field:
-        """The network's velocity field inside those of the guidance."""
+    ) -> Flow:
+        """The ODE of the network's velocity field inside those of the guidance."""
         kept = [*self.model.task.constraints()]
         known = [*dict.fromkeys([NONE, ALL, *kept, AROUND_OBSTACLES])]
         if guidance is not None and guidance not in known:
@@ -388,8 +381,13 @@ class Planner:
             # Guided as in training, with its margin; judged without.
             near = Sum([self._avoidance(disc, self.model.config.correction.margin) for disc in obstacles])
             weighted.append((Correction(near, self.model.u_c.smoothing), lambda_o))
-        v = self.model.field(NONE, ends)
-        return self.model.guided(v, *weighted) if weighted else v
+
+        def arrive(x_0: Tensor, ends: Tensor) -> Tensor:
+            v = self.model.field(NONE, ends)
+            v = self.model.guided(v, *weighted) if weighted else v
+            return integrate(v, x_0, sample.steps, sample.solver)
+
+        return arrive
 
     def _avoidance(self, disc: Obstacle, margin: float = 0.0) -> Constraint:
         """A disc as a constraint with the run's barrier."""
@@ -439,9 +437,7 @@ class DescentPlanner(Planner):
         """
         name = task if isinstance(task, str) else task.name if task.name in TASKS else config.PAPERS_TASK
         given = [f"{key.replace('__', '.')}={value}" for key, value in settings.items()]
-        chosen = config.load(
-            [f"task={name}", "ablation=plus", f"sample.descent={REPAIR_STEPS}", "sample.steps=1", *given]
-        )
+        chosen = config.load([f"task={name}", "ablation=plus", f"sample.descent={REPAIR_STEPS}", *given])
         made = build_task(chosen) if isinstance(task, str) else task
         if not isinstance(made, SceneTask):
             found = made.demonstrations(FITTED_TO, chosen.data.seed)
@@ -452,14 +448,13 @@ class DescentPlanner(Planner):
         task = self.model.task
         return task.between(y[:, [0, -1]], noise) if isinstance(task, SceneTask) else source.sample(y, noise)
 
-    def _field(
+    def _flow(
         self,
-        ends: Tensor,
         guidance: str | None,
         obstacles: Sequence[Obstacle],
         robot_weight: float | None,
         obstacle_weight: float | None,
-    ) -> Field:
+    ) -> Flow:
         for name, weight in {"robot_weight": robot_weight, "obstacle_weight": obstacle_weight}.items():
             if weight is not None:
                 raise PlanError(f"{name}={brief(weight)}: expected none, without a model there is no flow to guide")
@@ -467,7 +462,7 @@ class DescentPlanner(Planner):
             raise PlanError(
                 f"guidance={brief(guidance)}: expected all or none, without a model there is no flow to guide"
             )
-        return lambda x, t: torch.zeros_like(x)
+        return lambda x_0, ends: x_0
 
 
 def looks(propose: Callable[[int], Tensor], u_c: Correction) -> Iterator[Tensor]:
