@@ -24,7 +24,7 @@ def train(task: "Task | str" = config.PAPERS_TASK, ablation: str = "cgp", **sett
         ConfigError: a setting that cannot be used.
         DemonstrationError: demonstrations that cannot be used.
     """
-    chosen = config.load([*_task(task), f"ablation={ablation}", *_arguments(settings)])
+    chosen = config.load([*_task(task), f"ablation={ablation}", *config.arguments_of(settings)])
 
     from rich.console import Console
 
@@ -59,7 +59,7 @@ def compare(
 
     from conflow.results.comparison import collect
 
-    arguments = [*_task(task), *_arguments(settings)]
+    arguments = [*_task(task), *config.arguments_of(settings)]
     preset = config.load(arguments).preset
     found = collect(preset, [one for one in arguments if not one.startswith("preset=")], split)
     return pd.DataFrame(found.cells)
@@ -82,7 +82,3 @@ def _task(task: "Task | str") -> list[str]:
             expected = f'expected its name, task="{name}"' + f", and {', '.join(own)}" * bool(own)
             raise ConfigError(f"task={type(task).__name__}(...): {expected}")
     return [f"task={file_of(task)}"]
-
-
-def _arguments(settings: dict[str, Any]) -> list[str]:
-    return [f"{key.replace('__', '.')}={'null' if value is None else value}" for key, value in settings.items()]

@@ -436,8 +436,8 @@ class DescentPlanner(Planner):
             ConfigError: there is no such task, or a setting that cannot be used.
         """
         name = task if isinstance(task, str) else task.name if task.name in TASKS else config.PAPERS_TASK
-        given = [f"{key.replace('__', '.')}={value}" for key, value in settings.items()]
-        chosen = config.load([f"task={name}", "ablation=plus", f"sample.descent={REPAIR_STEPS}", *given])
+        given = ["ablation=plus", f"sample.descent={REPAIR_STEPS}", *config.arguments_of(settings)]
+        chosen = config.load([f"task={name}", *given])
         made = build_task(chosen) if isinstance(task, str) else task
         if not isinstance(made, SceneTask):
             found = made.demonstrations(FITTED_TO, chosen.data.seed)

@@ -9,7 +9,7 @@ import hashlib
 import math
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
@@ -178,6 +178,11 @@ def check_file(task: str) -> None:
 def names(axis: str) -> list[str]:
     """The tasks, ablations or presets that exist: the files under conf/<axis>/."""
     return sorted(file.stem for file in (CONF / axis).glob("*.yaml"))
+
+
+def arguments_of(settings: Mapping[str, Any]) -> list[str]:
+    """Settings by keyword as arguments `key=value`, such as train__max_steps=100 as train.max_steps=100."""
+    return [f"{key.replace('__', '.')}={'null' if value is None else value}" for key, value in settings.items()]
 
 
 def load(arguments: Sequence[str] = ()) -> Config:
