@@ -343,6 +343,18 @@ def test_plus_meets_start_and_goal_to_the_last_bit_under_every_setting(setting: 
     assert torch.equal(flow.source.observe(x), flow.source.observe(x_1))
 
 
+@pytest.mark.parametrize("steps", [1, 6])
+def test_guidance_by_descent_takes_the_steps_that_are_asked_for(steps: int) -> None:
+    flow = model("ablation=plus", "source.fit=false", f"sample.guidance_steps={steps}")
+    x, t = swap(50), torch.full((50,), 0.75)
+    v = flow.field("none")(x, t)
+    e = x + 0.25 * v
+    for _ in range(steps):
+        e = e + 0.5 * flow.u_c(e)
+    torch.testing.assert_close(flow.field("robot")(x, t), 4 * (e - x))
+    assert not torch.equal(flow.field("robot")(x, t), v)
+
+
 @pytest.mark.parametrize("t", [0.0, 0.5, 1.0])
 def test_guidance_at_the_end_acts_where_its_training_does(t: float) -> None:
     """v + lambda t u^c(x + (1 - t) v): nothing at t = 0, the plain guidance at t = 1."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from conflow.flow.path import end
-from conflow.flow.settings import Guidance, Solver
+from conflow.flow.settings import Solver
 
 Field = Callable[[Tensor, Tensor], Tensor]
 """A velocity field: x (batch, T, D) and t (batch,) to dx/dt (batch, T, D)."""
@@ -44,7 +44,7 @@ def guided_ahead(v: Field, push: Push) -> Field:
     return field
 
 
-def descended(v: Field, push: Push, steps: int = 4, since: float = 0.3) -> Field:
+def descended(v: Field, push: Push, steps: int, since: float = 0.3) -> Field:
     """(e - x) / (1 - t): towards the predicted end e = x + (1 - t) v(x, t) after steps e <- e + lambda u^c(e).
 
     The steps are of covariant gradient descent on the barrier, with lambda as their length: what is wrong with the end
@@ -65,13 +65,6 @@ def descended(v: Field, push: Push, steps: int = 4, since: float = 0.3) -> Field
         return u + (e - predicted) / left[:, None, None]
 
     return field
-
-
-GUIDANCE: dict[Guidance, Callable[[Field, Push], Field]] = {
-    "point": guided,
-    "end": guided_ahead,
-    "descent": descended,
-}
 
 
 def euler(v: Field, x: Tensor, t: Tensor, h: float) -> Tensor:

@@ -38,7 +38,11 @@ SPLITS: dict[SplitName, str] = {"val": "validation", "test": "test"}
 
 OF_TASK = "task."
 """Begins the settings that are a task's own."""
-LATER: dict[str, Tree] = {"data": {"unrepaired": 0.0}, "train": {"precision": "32"}, "sample": {"descent": 0}}
+LATER: dict[str, Tree] = {
+    "data": {"unrepaired": 0.0},
+    "train": {"precision": "32"},
+    "sample": {"descent": 0, "guidance_steps": 4},
+}
 """Settings that earlier runs lack, with their defaults: here, since a planner reads no YAML."""
 SIZES = (
     "data.num",
@@ -98,6 +102,7 @@ class Sample:
     solver: Solver
     steps: Count
     guidance: Guidance
+    guidance_steps: Count
     descent: Annotated[int, {"low": 0, "high": 10**6}]
     robot_weight: Weight
     obstacle_weight: Weight

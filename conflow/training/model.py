@@ -1,6 +1,6 @@
 """ConFlow as a torch module: Algorithm 1 of the paper, and sampling from what it trained. Needs torch alone."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial, reduce
 from operator import add
 from typing import cast
@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from conflow.flow.correction import Correction, descend
 from conflow.flow.network import Spectral
 from conflow.flow.path import end, guided_path, interpolate, velocity
-from conflow.flow.sampler import GUIDANCE, Field, in_pieces, integrate
+from conflow.flow.sampler import Field, Push, descended, guided, guided_ahead, in_pieces, integrate
+from conflow.flow.settings import Guidance
 from conflow.scene.constraint import Constraint
 from conflow.scene.robots import Crowd
 from conflow.scene.task import Task
@@ -162,7 +163,13 @@ class ConFlow(nn.Module):
         def push(x: Tensor) -> Tensor:
             return reduce(add, (weight * u_c(x) for u_c, weight in weighted))
 
-        return GUIDANCE[self.config.sample.guidance](v, push)
+        sample = self.config.sample
+        ways: dict[Guidance, Callable[[Field, Push], Field]] = {
+            "point": guided,
+            "end": guided_ahead,
+            "descent": partial(descended, steps=sample.guidance_steps),
+        }
+        return ways[sample.guidance](v, push)
 
     def sample(self, x_1: Tensor, setting: str = NONE, noise: torch.Generator | None = None) -> Tensor:
         """Trajectories from where each x_1 starts to where it ends, both (batch, T, D)."""
