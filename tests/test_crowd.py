@@ -19,7 +19,7 @@ from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import ALONG, AMPLITUDES, CrowdTask, singles
 from conflow.scene.tasks.weave import JITTER, PHASE
 from conflow.training import config
-from conflow.training.build import build_task
+from conflow.training.build import build_task, fitted
 from conflow.training.datamodule import Batches, DemonstrationData, Split
 
 crowds = pytest.mark.parametrize("task", sorted(CROWDS))
@@ -266,6 +266,15 @@ def test_training_takes_turns_between_numbers_of_robots() -> None:
     # Repaired: what was in collision no longer is, at the same starts and goals.
     assert data.violates.float().mean() > 0.4
     assert not data.train.violates.any()
+
+
+def test_demonstrations_are_the_same_for_a_trained_model_whose_source_is_fitted() -> None:
+    """Their repair is another one then, but it is of the same demonstrations."""
+    settings = config.load(["task=weave", "ablation=plus", "preset=smoke", "task.robots=[4, 6]", "data.num=30"])
+    data = DemonstrationData(settings)
+    again = DemonstrationData(fitted(settings, data.known))
+    assert again.digest == data.digest
+    assert not torch.equal(again.train.x, data.train.x)
 
 
 def test_one_class_alone_fills_a_batch_whatever_its_share_should_be() -> None:

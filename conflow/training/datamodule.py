@@ -105,7 +105,8 @@ class DemonstrationData(LightningDataModule):
         task: what they are for.
         others: of the task's other `variants`, for training alone.
         x, violates: all demonstrations and their labels M.
-        digest: fingerprint of x, and of the labels that came with it; others follow from x and the config.
+        digest: fingerprint of what was demonstrated, and of the labels that came with it; others follow from that and
+            the config.
 
     Raises:
         DemonstrationError: the demonstrations cannot be used, or a class that the ablation needs is missing.
@@ -127,9 +128,12 @@ class DemonstrationData(LightningDataModule):
         self.digest = demonstrations.digest(x, violates)
         self.held_out: dict[SplitName, Split] = {}
         self.train, self.val, self.test = self._split(self.origin)
-        self.others = self._others() if config.data.path is None else []
-        if self.others:
-            every = [self.digest, *(demonstrations.digest(one.x, None) for one in self.others)]
+        variants = self.task.variants()[:-1] if config.data.path is None else []
+        others = [(task, self._made(task).x) for task in variants]
+        self.others = self._shown(others)
+        if others:
+            # Before repair: that follows from the source, which of a trained model is fitted.
+            every = [self.digest, *(demonstrations.digest(x, None) for _, x in others)]
             self.digest = hashlib.sha256(" ".join(every).encode()).hexdigest()[: len(self.digest)]
 
     @property
@@ -207,11 +211,11 @@ class DemonstrationData(LightningDataModule):
                 raise DemonstrationError(f"{name}: {left}, expected {needed} or more")
         return train_split, val_split, test_split
 
-    def _others(self) -> list[Split]:
-        """What training sees of the task's other variants."""
+    def _shown(self, others: Sequence[tuple[Task, Tensor]]) -> list[Split]:
+        """What training sees of the demonstrations of the task's other variants."""
         data, found = self.config.data, []
-        for task in self.task.variants()[:-1]:
-            split = self._labelled(self._made(task).x, task)
+        for task, x in others:
+            split = self._labelled(x, task)
             split = self._repaired(split, task) if data.repair else split
             split = split if data.negatives else split.feasible()
             if len(split.x):
