@@ -1,8 +1,10 @@
 """Reciprocal collision avoidance (ORCA) by `pyrvo`, in a process of its own: in some maps a step of it never ends."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
-from multiprocessing import TimeoutError, get_context
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +86,13 @@ def outline(box: Box) -> list[list[float]]:
     return points
 
 
+def serve(crossings: Connection) -> None:
+    """Answers every crossing with its `walk`; begins with None, to say that it is there."""
+    crossings.send(None)
+    while True:
+        crossings.send(walk(crossings.recv()))
+
+
 class Simulator:
     """`walk` within a time: who does not come back is ended.
 
@@ -96,14 +105,19 @@ class Simulator:
         self._start()
 
     def __call__(self, crossing: Crossing, seconds: float) -> np.ndarray | None:
-        """As `walk`; None too if that takes longer than `seconds`."""
-        try:
-            return self._process.apply_async(walk, [crossing]).get(seconds)
-        except TimeoutError:
-            self._process.terminate()
-            self._start()
-            return None
+        """As `walk`; None too if that takes longer than `seconds`, or fails."""
+        self._walks.send(crossing)
+        if self._walks.poll(seconds):
+            with suppress(EOFError):
+                return self._walks.recv()
+        self._process.kill()
+        self._process.join()
+        self._start()
+        return None
 
     def _start(self) -> None:
-        self._process = get_context("spawn").Pool(1)
-        self._process.apply(len, [()])  # until it is there, so that no scene waits for it
+        self._walks, theirs = Pipe()
+        self._process = get_context("spawn").Process(target=serve, args=[theirs], daemon=True)
+        self._process.start()
+        theirs.close()  # so that the end of the process is the end of the pipe
+        self._walks.recv()  # so that no scene waits for its beginning

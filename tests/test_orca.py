@@ -48,3 +48,21 @@ def test_one_that_never_ends_is_ended_and_the_next_one_runs() -> None:
     assert simulate(Crossing(START, GOAL, 0.05, endless, (0,)), seconds=0.5) is None  # type: ignore[arg-type]
     assert time.monotonic() - began < 60  # to start a process again takes some seconds on a busy machine
     assert simulate(Crossing(START, GOAL, 0.05, [], (0,)), seconds=60) is not None
+
+
+def test_a_time_that_is_over_just_as_the_answer_comes_leaves_no_lock_behind() -> None:
+    pytest.importorskip("pyrvo")
+    simulate, crossing = Simulator(), Crossing(START, GOAL, 0.05, [BOX], (0,))
+    began = time.monotonic()
+    assert simulate(crossing, seconds=60) is not None
+    takes = time.monotonic() - began
+    for share in (0.6, 0.8, 0.9, 1.0, 1.1, 1.3):
+        simulate(crossing, share * takes)
+    assert simulate(crossing, seconds=60) is not None
+
+
+def test_a_process_that_dies_has_not_solved_its_scene() -> None:
+    pytest.importorskip("pyrvo")
+    simulate = Simulator()
+    assert simulate(Crossing(START, GOAL, 0.05, None, (0,)), seconds=60) is None  # type: ignore[arg-type]
+    assert simulate(Crossing(START, GOAL, 0.05, [], (0,)), seconds=60) is not None
