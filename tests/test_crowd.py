@@ -275,6 +275,10 @@ def test_demonstrations_are_the_same_for_a_trained_model_whose_source_is_fitted(
     again = DemonstrationData(fitted(settings, data.known))
     assert again.digest == data.digest
     assert not torch.equal(again.train.x, data.train.x)
+    known_again = DemonstrationData(fitted(settings, data.known), training=False)
+    assert known_again.digest == data.digest
+    assert torch.equal(known_again.held_out["val"].x, data.held_out["val"].x)
+    assert not hasattr(known_again, "train")
 
 
 def test_one_class_alone_fills_a_batch_whatever_its_share_should_be() -> None:

@@ -387,7 +387,7 @@ def _attempt(number: int, arguments: list[str], sha: str, any_code: bool, place:
 def _elsewhere(cell: Job, any_code: bool) -> str:
     """The machine where another process trains a cell now, or did until it fell silent less than ten minutes ago."""
     try:
-        digest = DemonstrationData(cell.config).digest
+        digest = DemonstrationData(cell.config, training=False).digest
     except DemonstrationError:
         return ""
     for run in store.runs("RUNNING", config_sha=cell.config.sha(), data_digest=digest):

@@ -126,7 +126,7 @@ def overview(cells: Sequence[Job]) -> tuple[float, str]:
 def finished(cell: Job, any_code: bool) -> bool:
     """Whether a cell is; if it was interrupted, it is told to go on from there, and if by other code, why it is not."""
     try:
-        digest = DemonstrationData(cell.config).digest
+        digest = DemonstrationData(cell.config, training=False).digest
     except DemonstrationError:
         return False  # the cell itself will say so, and the others go on
     runs = store.runs(config_sha=cell.config.sha(), data_digest=digest)

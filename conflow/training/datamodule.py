@@ -98,6 +98,12 @@ class DemonstrationData(LightningDataModule):
     trajectories only lend their starts and goals to the samples, so every ablation is asked the same questions.
     `train` keeps no trajectory of `val` or `test`.
 
+    Args:
+        config: the experiment.
+        task: what they are for; by default what the config names.
+        training: whether a model is to be trained on them. To sample one again, or to know them again, takes neither
+            repair nor all classes: there is no `train`, `val` and `others` then.
+
     Attributes:
         held_out: what models are measured on, D+ and D- as they were demonstrated: `test`, and all of the validation
             split, of which `val` is what val/loss is taken on.
@@ -113,7 +119,7 @@ class DemonstrationData(LightningDataModule):
         ConfigError: so many demonstrations or samples do not fit into this machine's memory.
     """
 
-    def __init__(self, config: Config, task: Task | None = None) -> None:
+    def __init__(self, config: Config, task: Task | None = None, training: bool = True) -> None:
         super().__init__()
         self.config = config
         self.origin, found, self.task = self._demonstrations(task)
@@ -126,11 +132,14 @@ class DemonstrationData(LightningDataModule):
         check_memory("sample.num", config.sample.num, pieces * 4 * config.sample.num * self.T * self.D)
         self.violates = labels(config, self.task).violation(x) if violates is None else violates
         self.digest = demonstrations.digest(x, violates)
-        self.held_out: dict[SplitName, Split] = {}
-        self.train, self.val, self.test = self._split(self.origin)
+        whole, val, self.test = self._split()
+        self.held_out: dict[SplitName, Split] = {"val": val, "test": self.test}
         variants = self.task.variants()[:-1] if config.data.path is None else []
         others = [(task, self._made(task).x) for task in variants]
-        self.others = self._shown(others)
+        if training:
+            self.train, self.val = self._shown(whole, val)
+            shown = [self._of_variant(x, task) for task, x in others]
+            self.others = [split for split in shown if len(split.x)]
         if others:
             # Before repair: that follows from the source, which of a trained model is fitted.
             every = [self.digest, *(demonstrations.digest(x, None) for _, x in others)]
@@ -177,50 +186,46 @@ class DemonstrationData(LightningDataModule):
         except DemonstrationError as error:
             raise DemonstrationError(f"{origin}: {error}") from None
 
-    def _split(self, name: str) -> tuple[Split, Split, Split]:
+    def _split(self) -> list[Split]:
+        """For training, validation and test, as they were demonstrated."""
         data = self.config.data
         order = torch.randperm(len(self.x), generator=random_stream("split", data.seed))
         val, test = round(data.val_fraction * len(order)), round(data.test_fraction * len(order))
         parts = torch.split(order, [len(order) - val - test, val, test])
-        train_split, val_split, test_split = (Split(self.x[i], self.violates[i]) for i in parts)
-        self.held_out |= {"val": val_split, "test": test_split}
+        # Of a single test trajectory there is no diversity.
+        self._check_left("test", len(parts[2]), 2)
+        return [Split(self.x[i], self.violates[i]) for i in parts]
+
+    def _shown(self, train_split: Split, val_split: Split) -> tuple[Split, Split]:
+        """What training sees of its own split and of that of validation."""
+        data = self.config.data
+        needs = f"and ablation {self.config.ablation} needs"
         if data.negatives and not bool(train_split.violates.any()):
-            raise DemonstrationError(
-                f"{name}: no trajectory for training violates the constraint, and ablation "
-                f"{self.config.ablation} needs D-"
-            )
+            raise DemonstrationError(f"{self.origin}: no trajectory for training violates the constraint, {needs} D-")
         if data.repair:
             train_split, val_split = (self._repaired(one, self.task) for one in (train_split, val_split))
         # A correction at the predicted end says itself what is feasible; any other method has to be shown it.
         shown = not data.negatives or self.config.correction.at != "end"
         if shown and len(train_split.x) and bool(train_split.violates.all()):
             raise DemonstrationError(
-                f"{name}: no trajectory for training is feasible out of {len(train_split.x)}, and ablation "
-                f"{self.config.ablation} needs D+"
+                f"{self.origin}: no trajectory for training is feasible out of {len(train_split.x)}, {needs} D+"
             )
         if not data.negatives:
             train_split, val_split = train_split.feasible(), val_split.feasible()
-        # Of a single test trajectory there is no diversity.
-        for part, split, needed in (
-            ("training", train_split, 1),
-            ("validation", val_split, 1),
-            ("test", test_split, 2),
-        ):
-            if len(split.x) < needed:
-                left = f"{len(split.x)} trajectories are left for {part} out of {len(self.x)}"
-                raise DemonstrationError(f"{name}: {left}, expected {needed} or more")
-        return train_split, val_split, test_split
+        self._check_left("training", len(train_split.x), 1)
+        self._check_left("validation", len(val_split.x), 1)
+        return train_split, val_split
 
-    def _shown(self, others: Sequence[tuple[Task, Tensor]]) -> list[Split]:
-        """What training sees of the demonstrations of the task's other variants."""
-        data, found = self.config.data, []
-        for task, x in others:
-            split = self._labelled(x, task)
-            split = self._repaired(split, task) if data.repair else split
-            split = split if data.negatives else split.feasible()
-            if len(split.x):
-                found.append(split)
-        return found
+    def _check_left(self, part: str, left: int, needed: int) -> None:
+        if left < needed:
+            said = f"{left} trajectories are left for {part} out of {len(self.x)}"
+            raise DemonstrationError(f"{self.origin}: {said}, expected {needed} or more")
+
+    def _of_variant(self, x: Tensor, task: Task) -> Split:
+        """What training sees of the demonstrations of another of the task's variants."""
+        split = self._labelled(x, task)
+        split = self._repaired(split, task) if self.config.data.repair else split
+        return split if self.config.data.negatives else split.feasible()
 
     def _repaired(self, split: Split, task: Task) -> Split:
         """The trajectories of a split, but for a share `data.unrepaired`, out of collision, with new labels."""

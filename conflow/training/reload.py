@@ -24,7 +24,7 @@ def demonstrations(run: Run, model: ConFlow) -> DemonstrationData:
         ConfigError: they are others by now.
     """
     own = None if model.config.data.path is not None and model.config.task in TASKS else model.task
-    data = DemonstrationData(model.config, own)
+    data = DemonstrationData(model.config, own, training=False)
     resume.check_data(run, data.origin, data.digest)
     return data
 
