@@ -21,6 +21,7 @@ from torch import Tensor
 from conflow import commandline
 from conflow.errors import ConfigError
 from conflow.figures.planbench import animation, success
+from conflow.figures.workspace import DPI
 from conflow.orca import Crossing, Simulator
 from conflow.planner import exact, looks
 from conflow.results import planbench as results
@@ -312,8 +313,8 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
         record = run(named, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)
     path = results.write(record, Path(options["out"]))
-    picture = path.with_suffix(".png")
-    success(record.task, record.robots, {row.method: (row.seconds, row.passed) for row in record.rows}, picture)
+    attempts = {row.method: (row.seconds, row.passed) for row in record.rows}
+    success(record.task, record.robots, attempts).savefig(path.with_suffix(".png"), dpi=DPI)
     if record.plan and isinstance(task, CrowdTask):
         boxes = task.in_scene(robots, seed, 0).boxes()
         animation(torch.tensor(record.plan), task.robots.radius, boxes, path.with_suffix(".gif"))

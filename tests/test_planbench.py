@@ -260,17 +260,22 @@ def test_an_option_that_cannot_be_used_is_named(option: str, said: str) -> None:
     assert str(refused.value).startswith(said)
 
 
-def test_what_is_solved_is_drawn_against_time_and_one_plan_in_motion(record: Record, tmp_path: Path) -> None:
-    success("weave", 8, {row.method: (row.seconds, row.passed) for row in record.rows}, tmp_path / "success.png")
-    success("weave", 8, {"none": ([1.0, 2.0], [False, False])}, tmp_path / "unsolved.png")
+def test_one_plan_is_drawn_in_motion(record: Record, tmp_path: Path) -> None:
     animation(
         torch.tensor(record.plan), 0.05, [Box(0, 0, 0.8, 0.1, 0.015), Box(0.5, 0.5, 0.2, 0.2)], tmp_path / "plan.gif"
     )
-    for name in ("success.png", "unsolved.png"):
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "plan.gif").read_bytes().startswith(b"GIF89a")
     assert (tmp_path / "plan.gif").stat().st_size < 500_000
     assert np.array(record.plan).shape == (64, 16)
+
+
+def test_the_share_of_solved_scenes_rises_with_the_time_that_each_may_take() -> None:
+    """Also of who solves none there is a line to be seen."""
+    figure = success("weave", 8, {"some": ([3.0, 1.0, 2.0], [True, True, False]), "none": ([4.0] * 3, [False] * 3)})
+    some, none = (np.asarray(line.get_xydata(), dtype=float) for line in figure.axes[0].lines)
+    np.testing.assert_allclose(some, [[1.0, 0.0], [1.0, 1 / 3], [3.0, 2 / 3], [4.0, 2 / 3]])
+    np.testing.assert_allclose(none, [[1.0, 0.0], [4.0, 0.0]])
+    assert figure.axes[0].get_ylim()[0] < 0
 
 
 def test_a_map_is_drawn_where_trajectories_are(tmp_path: Path) -> None:

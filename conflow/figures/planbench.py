@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from torch import Tensor
 
-from conflow.figures.workspace import DPI, rounded
+from conflow.figures.workspace import rounded
 from conflow.scene.settings import Box
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -21,23 +21,31 @@ Attempts = tuple[Sequence[float], Sequence[bool]]
 """Seconds of every attempt, and whether it solved its scene."""
 
 
-def success(task: str, robots: int, methods: Mapping[str, Attempts], path: Path) -> None:
-    """Draw the share of scenes that are solved against the time that each may take, by method, into a file."""
+def success(task: str, robots: int, methods: Mapping[str, Attempts]) -> Figure:
+    """The share of scenes that are solved against the time that each may take, by method."""
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
-    axis = figure.add_subplot(xscale="log", ylim=(0, 1.02), xlabel="time a scene may take (s)", ylabel="scenes solved")
-    latest = max(max(seconds) for seconds, _ in methods.values())
+    axis = figure.add_subplot(
+        xscale="log", ylim=(-0.02, 1.02), xlabel="time a scene may take (s)", ylabel="scenes solved"
+    )
+    first, last = (end(end(seconds) for seconds, _ in methods.values()) for end in (min, max))
     for i, (name, (seconds, passed)) in enumerate(methods.items()):
         solved = sorted(second for second, good in zip(seconds, passed, strict=True) if good)
-        share = [k / len(seconds) for k in range(1, len(solved) + 1)]
-        ends = [*solved, latest], [*share, share[-1] if share else 0.0]
-        axis.step(*ends, where="post", color=COLOURS[i % len(COLOURS)], label=name, lw=1.8)
+        share = [k / len(seconds) for k in range(len(solved) + 1)]
+        axis.step(
+            [first, *solved, last],
+            [*share, share[-1]],
+            where="post",
+            color=COLOURS[i % len(COLOURS)],
+            label=name,
+            lw=1.8,
+        )
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.xaxis.set_minor_locator(NullLocator())
     axis.set_title(f"{task}, {robots} robots, {len(next(iter(methods.values()))[0])} scenes")
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, loc="best", fontsize=9)
-    figure.savefig(path, dpi=DPI)
+    return figure
 
 
 def animation(x: Tensor, radius: float, boxes: Sequence[Box], path: Path) -> None:
