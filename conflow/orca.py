@@ -1,5 +1,6 @@
 """Reciprocal collision avoidance (ORCA) by `pyrvo`, in a process of its own: in some maps a step of it never ends."""
 
+import signal
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -88,9 +89,11 @@ def outline(box: Box) -> list[list[float]]:
 
 def serve(crossings: Connection) -> None:
     """Answers every crossing with its `walk`; begins with None, to say that it is there."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: whoever asks is told too, and ends this
     crossings.send(None)
-    while True:
-        crossings.send(walk(crossings.recv()))
+    with suppress(EOFError):  # nobody asks any more
+        while True:
+            crossings.send(walk(crossings.recv()))
 
 
 class Simulator:
