@@ -140,6 +140,7 @@ class DemonstrationData(LightningDataModule):
             self.train, self.val = self._shown(whole, val)
             shown = [self._of_variant(x, task) for task, x in others]
             self.others = [split for split in shown if len(split.x)]
+        self._check_left("test", len(self.test.x), 2)  # of a single one there is no diversity
         if others:
             # Before repair: that follows from the source, which of a trained model is fitted.
             every = [self.digest, *(demonstrations.digest(x, None) for _, x in others)]
@@ -192,8 +193,6 @@ class DemonstrationData(LightningDataModule):
         order = torch.randperm(len(self.x), generator=random_stream("split", data.seed))
         val, test = round(data.val_fraction * len(order)), round(data.test_fraction * len(order))
         parts = torch.split(order, [len(order) - val - test, val, test])
-        # Of a single test trajectory there is no diversity.
-        self._check_left("test", len(parts[2]), 2)
         return [Split(self.x[i], self.violates[i]) for i in parts]
 
     def _shown(self, train_split: Split, val_split: Split) -> tuple[Split, Split]:
