@@ -14,8 +14,6 @@ from conflow.scene.settings import Box
 
 STEP, SPEED, JITTER = 0.05, 0.6, 1e-3
 """Seconds of a simulated step; the top speed, that of demonstrations; and how much of it is chance."""
-STEPS = 200
-"""After which robots are given up: twice the time of a demonstration."""
 SEES, AHEAD = 1.0, 2.0
 """How far robots see each other, and for how many seconds ahead they avoid each other and what is in the way."""
 ARRIVED = 0.05
@@ -31,6 +29,7 @@ class Crossing(NamedTuple):
         start, goal: of robots, (count, 2).
         radius: of all robots.
         boxes: what is in the way.
+        seconds: after which robots are given up.
         seed: of the jitter.
     """
 
@@ -38,6 +37,7 @@ class Crossing(NamedTuple):
     goal: np.ndarray
     radius: float
     boxes: Sequence[Box]
+    seconds: float
     seed: Sequence[int]
 
 
@@ -49,7 +49,7 @@ def walk(crossing: Crossing) -> np.ndarray | None:
     """
     import pyrvo
 
-    start, goal, radius, boxes, seed = crossing
+    start, goal, radius, boxes, seconds, seed = crossing
     draw, count = np.random.default_rng(seed), len(start)
     # Half a percent more than the radius, since it lets discs touch.
     simulator = pyrvo.RVOSimulator(STEP, SEES, count, AHEAD, AHEAD, 1.005 * radius, SPEED)
@@ -59,7 +59,7 @@ def walk(crossing: Crossing) -> np.ndarray | None:
         simulator.add_obstacle(outline(box))
     simulator.process_obstacles()
     at, path = start, [start]
-    for _ in range(STEPS):
+    for _ in range(round(seconds / STEP)):
         wanted = (goal - at) / STEP
         speed = np.linalg.norm(wanted, axis=1, keepdims=True)
         wanted *= np.minimum(1, SPEED / np.maximum(speed, 1e-9))

@@ -32,7 +32,7 @@ def test_the_polygon_of_a_rounded_box_goes_round_it_and_hardly_farther() -> None
 
 def test_robots_arrive_and_keep_their_distance_from_each_other_and_from_the_map() -> None:
     pytest.importorskip("pyrvo")
-    path = Simulator()(Crossing(START, GOAL, 0.05, [BOX], (0,)), seconds=60)
+    path = Simulator()(Crossing(START, GOAL, 0.05, [BOX], 10.0, (0,)), seconds=60)
     assert path is not None
     assert np.linalg.norm(path[-1] - GOAL, axis=1).max() <= ARRIVED
     assert np.linalg.norm(path[:, 0] - path[:, 1], axis=1).min() >= 0.1
@@ -41,18 +41,24 @@ def test_robots_arrive_and_keep_their_distance_from_each_other_and_from_the_map(
     assert MapAvoidance(Crowd(2, 0.05), [BOX]).clearance(x).min() >= -1e-4
 
 
+def test_who_needs_longer_is_given_up() -> None:
+    """The way is 1.6 long and the top speed 0.6, so 2.5 seconds are too few."""
+    pytest.importorskip("pyrvo")
+    assert Simulator()(Crossing(START, GOAL, 0.05, [], 2.5, (0,)), seconds=60) is None
+
+
 def test_one_that_never_ends_is_ended_and_the_next_one_runs() -> None:
     pytest.importorskip("pyrvo")
     simulate, began = Simulator(), time.monotonic()
     endless = itertools.repeat(BOX)  # obstacles that are never all there
-    assert simulate(Crossing(START, GOAL, 0.05, endless, (0,)), seconds=0.5) is None  # type: ignore[arg-type]
+    assert simulate(Crossing(START, GOAL, 0.05, endless, 10.0, (0,)), seconds=0.5) is None  # type: ignore[arg-type]
     assert time.monotonic() - began < 60  # to start a process again takes some seconds on a busy machine
-    assert simulate(Crossing(START, GOAL, 0.05, [], (0,)), seconds=60) is not None
+    assert simulate(Crossing(START, GOAL, 0.05, [], 10.0, (0,)), seconds=60) is not None
 
 
 def test_a_time_that_is_over_just_as_the_answer_comes_leaves_no_lock_behind() -> None:
     pytest.importorskip("pyrvo")
-    simulate, crossing = Simulator(), Crossing(START, GOAL, 0.05, [BOX], (0,))
+    simulate, crossing = Simulator(), Crossing(START, GOAL, 0.05, [BOX], 10.0, (0,))
     began = time.monotonic()
     assert simulate(crossing, seconds=60) is not None
     takes = time.monotonic() - began
@@ -64,5 +70,5 @@ def test_a_time_that_is_over_just_as_the_answer_comes_leaves_no_lock_behind() ->
 def test_a_process_that_dies_has_not_solved_its_scene() -> None:
     pytest.importorskip("pyrvo")
     simulate = Simulator()
-    assert simulate(Crossing(START, GOAL, 0.05, None, (0,)), seconds=60) is None  # type: ignore[arg-type]
-    assert simulate(Crossing(START, GOAL, 0.05, [], (0,)), seconds=60) is not None
+    assert simulate(Crossing(START, GOAL, 0.05, None, 10.0, (0,)), seconds=60) is None  # type: ignore[arg-type]
+    assert simulate(Crossing(START, GOAL, 0.05, [], 10.0, (0,)), seconds=60) is not None
