@@ -280,7 +280,7 @@ def published(preset: str, *rates: tuple[str, int, float | None]) -> Comparison:
     """Of methods at a preset, how many of 1,000 collide and the energy distance."""
     cells = []
     for method, count, distance in rates:
-        rate = Cell("3", method, RATE, None, count / 1000, None, None, 0, 1, 0, 1, 1, count, 1000, preset, None)
+        rate = Cell("3", method, RATE, None, count / 1000, None, None, 0, 1, 0, 1, 1, count, 1000, preset, "", None)
         cells += [rate] if distance is None else [rate, replace(rate, column=DISTANCE, value=distance)]
     return Comparison(preset, cells, [Claim("", "no runs", None, None, None, "")], {}, {}, "", {}, "", "test", [], [])
 

@@ -236,6 +236,24 @@ def test_tables_of_record_pool_seeds_and_keep_other_readings_apart() -> None:
     )
 
 
+def test_a_run_in_bf16_counts_for_a_seed_that_has_none_in_single_precision() -> None:
+    """The row says which seed is of which precision and machine, and how both are made again."""
+    published("cgp", 0, 300)
+    published("cgp", 0, 100, "train.precision=bf16")
+    published("cgp", 1, 200, "train.precision=bf16")
+    (found,) = comparison.collect_reference()
+    plain = cell(found, "1", "ConFlow (D+ and D-)", "none: robot")
+    assert (plain.count, plain.seeds) == (500, 2)
+    assert plain.machine == "s0: 32 bits on a machine; s1: bf16 on a machine"
+    assert found.commands["ConFlow (D+ and D-)"] == (
+        'make ablations ABLATIONS=cgp SEEDS="0" PRESET=quick && '
+        "make ablations ABLATIONS=cgp SEEDS=\"1\" PRESET=quick ARGS='train.precision=bf16'"
+    )
+    # Seed 0 in both stands beside each other.
+    beside = cell(found, "4", "ConFlow (D+ and D-), train.precision=bf16", "none: robot")
+    assert (beside.count, beside.seeds, beside.machine) == (100, 1, "bf16 on a machine")
+
+
 def test_readings_of_another_task_show_its_own_collisions() -> None:
     """Of arms, which have no robots' discs that could collide."""
     path = Path(__file__).parents[1] / "runs/reference/runs/pandas-no_negatives-quick-sample.steps=25-s0.json"

@@ -89,10 +89,25 @@ def collect_reference() -> list[Comparison]:
 
 def _of_records(published: Sequence[Record]) -> Comparison:
     """Compare records of one task at one preset."""
-    plain, changed = ([one for one in published if bool(one.changes) == of_changed] for of_changed in (False, True))
+    plain, changed = _apart(published)
     runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
     found = _comparison(published[0].preset, runs, readings, _of_different_code(runs | readings), "test", [])
     return found if found.task == PAPERS_TASK else _with_task(found)
+
+
+def _apart(published: Iterable[Record]) -> tuple[list[Record], list[Record]]:
+    """Records of a preset as it stands, one for each ablation and seed, and those of changed settings.
+
+    In which precision a network was trained is a matter of the machine and no reading of the paper. So a run in bf16
+    counts for its seed, unless there is one in single precision; then it stands beside it as a changed one.
+    """
+    plain: dict[tuple[str, int], Record] = {}
+    changed = []
+    for one in sorted(published, key=lambda one: bool(one.changes)):
+        counts = one.of_preset and plain.setdefault((one.ablation, one.seed), one) is one
+        if not counts:
+            changed.append(one)
+    return list(plain.values()), changed
 
 
 def _with_task(found: Comparison) -> Comparison:
@@ -217,7 +232,12 @@ def _commands(
 
 
 def _command(runs: Sequence[Record]) -> str:
-    """What makes these runs again."""
+    """What makes these runs again, those of each precision in turn."""
+    return " && ".join(map(_command_of, _grouped(runs, lambda one: " ".join(one.changes)).values()))
+
+
+def _command_of(runs: Sequence[Record]) -> str:
+    """What makes runs with the same changes again."""
     seeds, one = " ".join(str(of_seed.seed) for of_seed in runs), runs[0]
     # Without the spaces of a list, at which the shell would cut it.
     changes = [change.replace(", ", ",") for change in one.changes]

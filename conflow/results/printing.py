@@ -160,7 +160,8 @@ def _rate(cell: Cell) -> str:
 
 
 def _size(cell: Cell) -> str:
-    return f"{cell.preset}, {_seeds(cell)}, {cell.trajectories} trajectories"
+    size = f"{cell.preset}, {_seeds(cell)}, {cell.trajectories} trajectories"
+    return size if cell.without_model else f"{size}\n{cell.machine}"
 
 
 def _seeds(cell: Cell) -> str:

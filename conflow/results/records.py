@@ -23,6 +23,9 @@ SUCCESS = re.compile(r"/success_(rate|low|high|count)$")
 ORIGIN = ("code_sha", "code", "git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
 
 
+PRECISION = "train.precision"
+
+
 @dataclass(frozen=True)
 class Record:
     """One run's numbers, and all that is needed to get them again.
@@ -118,6 +121,17 @@ class Record:
             if value != str(named.get(key, None if key.startswith(OF_TASK) else value))
         }
         return [f"{key}={'null' if value == 'None' else value}" for key, value in changed.items()]
+
+    @property
+    def machine(self) -> str:
+        """The precision of the network's layers in training, and the hardware."""
+        precision = self.settings.get(PRECISION, "32").replace("32", "32 bits")
+        return f"{precision} on {self.origin.get('hardware', 'an unknown machine')}"
+
+    @property
+    def of_preset(self) -> bool:
+        """Whether this is its task, ablation and preset as they stand, in whichever precision."""
+        return all(change.startswith(f"{PRECISION}=") for change in self.changes)
 
     @property
     def chosen(self) -> str:

@@ -109,6 +109,7 @@ class Cell:
         count: trajectories that the rate counts, over all seeds, of a rate.
         trajectories: over all seeds.
         preset: the scale that it was measured at.
+        machine: the precision and the hardware that its networks were trained in and on, by seed where they differ.
         differs: whether the paper's rate is another than one new network of this method would reach in as many
             trajectories; none where that is not judged.
     """
@@ -128,6 +129,7 @@ class Cell:
     count: int | None
     trajectories: int
     preset: str
+    machine: str
     differs: bool | None
 
     @property
@@ -271,8 +273,18 @@ def cell(table: str, row: str, column: str, printed: float | None, metric: str, 
         the_papers = Score.of_rate(round(printed * paper.TRAJECTORIES), paper.TRAJECTORIES)
         differs = statistics.differs(list(scores(metric, runs).values()), the_papers)
     values, trajectories = [_value(metric, run) for run in runs], sum(_trajectories(metric, run) for run in runs)
-    across = (min(values), max(values), len(runs), count, trajectories, runs[0].preset)
+    across = (min(values), max(values), len(runs), count, trajectories, runs[0].preset, _machine(runs))
     return Cell(table, row, column, printed, value, low, high, within[0], within[1], *across, differs)
+
+
+def _machine(runs: Sequence[Record]) -> str:
+    """The precision and the hardware of runs, by seed where they differ."""
+    seeds: dict[str, list[str]] = {}
+    for run in runs:
+        seeds.setdefault(run.machine, []).append(f"s{run.seed}")
+    if len(seeds) == 1:
+        return next(iter(seeds))
+    return "; ".join(f"{', '.join(those)}: {machine}" for machine, those in seeds.items())
 
 
 def _rate(metric: str, runs: Sequence[Record]) -> tuple[int, float, Interval, Interval]:
