@@ -12,6 +12,8 @@ from conflow.flow.source import Source
 
 SEEN = 4.0
 """Standard deviations beyond which there is next to nothing to learn from."""
+FAINT = 0.1
+"""Of the source's width in a mode: where demonstrations are narrower, x_t shows the source's noise and little else."""
 NARROWEST = 1000.0
 """How many times narrower than the leading mode one is that still counts as narrow, and not as empty."""
 
@@ -82,7 +84,8 @@ class Spectral(Velocity, ABC):
 
     h_theta sees z / sigma_t, the conditioned values x_O, Fourier features of t, clearances, and grad C in the modes.
     Of z / sigma_t it sees no more than +-SEEN: where a correction has pushed x out of all that training shows, in a
-    mode that is narrow, h_theta is not asked for what it never learned, and a z alone brings it back.
+    mode that is narrow, h_theta is not asked for what it never learned, and a z alone brings it back. Of a mode in
+    which demonstrations are narrower than FAINT sigma_0 it sees nothing.
 
     Args:
         source: its modes, usually a few leading ones.
@@ -112,11 +115,14 @@ class Spectral(Velocity, ABC):
         self.register_buffer("frequencies", torch.pi * torch.arange(1, frequencies + 1), persistent=False)
 
     def fit(self, x_1: Tensor) -> None:
-        """Set sigma_1^2 to the second moments of demonstrations x_1 (N, T, D) about W x_O, at least rounding's size."""
+        """Set sigma_1^2 to the second moments of demonstrations x_1 (N, T, D) about W x_O.
+
+        At least the square of rounding, which x_1 of size 1 has: a mode that is empty ends as empty as it can be.
+        """
         squares = self.coordinates(x_1).square().mean(dim=0)
         if self.variance.shape[1] == 1:
             squares = squares.mean(dim=1, keepdim=True)
-        self.variance = squares.clamp_min(torch.finfo(x_1.dtype).eps)
+        self.variance = squares.clamp_min(torch.finfo(x_1.dtype).eps ** 2)
 
     def coordinates(self, x: Tensor) -> Tensor:
         """z = E^T (x - W x_O), (batch, m, D)."""
@@ -140,7 +146,8 @@ class Spectral(Velocity, ABC):
         sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
         a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2
         c = (self.source_variance * self.variance).sqrt() / sigma_t
-        return along(self.modes, a * z + c * self.rest(x, (z / sigma_t).clamp(-SEEN, SEEN), t))
+        bound = SEEN * (self.variance > FAINT**2 * self.source_variance)
+        return along(self.modes, a * z + c * self.rest(x, (z / sigma_t).clamp(-bound, bound), t))
 
     @abstractmethod
     def rest(self, x: Tensor, z: Tensor, t: Tensor) -> Tensor:
