@@ -193,7 +193,7 @@ def test_every_format_says_of_which_task_a_number_is() -> None:
     with console.capture() as captured:
         printing.render(comparison.collect_reference(), "markdown", console)
     overview = captured.get().partition("at each preset, ")[2].splitlines()
-    assert overview[2] == "|  | paper | long | quick |"
+    assert overview[2] == "|  | printed in the paper | preset long | preset quick |"
     assert [line.split(" | ")[0] for line in overview[4:] if line.startswith("| ")] == ["| plus: the best together"]
 
 
@@ -319,7 +319,7 @@ def test_every_preset_is_compared_for_itself_the_one_of_most_training_first() ->
     text = captured.get()
     low, high = wilson(300, 1000)
     overview = text[text.index("**Robot collisions without guidance, at each preset, test split**") :].splitlines()
-    assert overview[2] == "|  | paper | long | quick |"
+    assert overview[2] == "|  | printed in the paper | preset long | preset quick |"
     assert overview[4].startswith("| ConFlow (D+ and D-) | 0.016 | 0.0160, within this network [")
     beside = f"0.3000, within this network [{low:.4f}, {high:.4f}]<br>300 of 1000, 1 seed"
     assert overview[4].endswith(f"16 of 1000, 1 seed | {beside} |")

@@ -152,7 +152,7 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
             paper = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")
             rows.append([method, paper, *(_rate(cell) if cell else "" for cell in of_row)])
     title = f"Robot collisions without guidance, at each preset, {SPLITS[comparisons[0].split]} split"
-    return title, ["", "paper", *presets], rows
+    return title, ["", "printed in the paper", *(f"preset {one}" for one in presets)], rows
 
 
 def _rate(cell: Cell) -> str:
