@@ -14,6 +14,8 @@ SEEN = 4.0
 """Standard deviations beyond which there is next to nothing to learn from."""
 FAINT = 0.1
 """Of the source's width in a mode: where demonstrations are narrower, x_t shows the source's noise and little else."""
+SLIGHT = 0.01
+"""Of the source's width in the leading mode: where it is narrower, its noise hardly moves x_t."""
 NARROWEST = 1000.0
 """How many times narrower than the leading mode one is that still counts as narrow, and not as empty."""
 
@@ -85,7 +87,7 @@ class Spectral(Velocity, ABC):
     h_theta sees z / sigma_t, the conditioned values x_O, Fourier features of t, clearances, and grad C in the modes.
     Of z / sigma_t it sees no more than +-SEEN: where a correction has pushed x out of all that training shows, in a
     mode that is narrow, h_theta is not asked for what it never learned, and a z alone brings it back. Of a mode in
-    which demonstrations are narrower than FAINT sigma_0 it sees nothing.
+    which the source is SLIGHT and demonstrations are FAINT it sees nothing: there is only noise.
 
     Args:
         source: its modes, usually a few leading ones.
@@ -146,7 +148,9 @@ class Spectral(Velocity, ABC):
         sigma_t = (s**2 * self.variance + (1 - s) ** 2 * self.source_variance).sqrt()
         a = (s * self.variance - (1 - s) * self.source_variance) / sigma_t**2
         c = (self.source_variance * self.variance).sqrt() / sigma_t
-        bound = SEEN * (self.variance > FAINT**2 * self.source_variance)
+        faint = self.variance <= FAINT**2 * self.source_variance
+        slight = self.source_variance <= SLIGHT**2 * self.source_variance[0]
+        bound = SEEN * ~(faint & slight)
         return along(self.modes, a * z + c * self.rest(x, (z / sigma_t).clamp(-bound, bound), t))
 
     @abstractmethod
