@@ -214,6 +214,15 @@ def test_every_column_of_the_papers_first_table_has_its_cell(comparison: Compari
     assert columns == set(COLLISIONS.values())
 
 
+def test_what_is_missing_of_the_papers_methods_is_named(comparison: Comparison) -> None:
+    said = "Of the paper's methods there is no finished run of ConFlow (D+)"
+    assert said in rendered(comparison, "markdown").splitlines()
+    of_other_task = replace(comparison, task="social")
+    assert said not in rendered(of_other_task, "markdown")
+    without_its_rows = replace(comparison, cells=[one for one in comparison.cells if one.without_model])
+    assert said not in rendered(without_its_rows, "markdown")
+
+
 def test_table_3_guards_every_ablation_and_what_no_model_touched(comparison: Comparison) -> None:
     rows: dict[str, list[str]] = {}
     for each in comparison.cells:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from conflow.errors import ConfigError
+from conflow.results import paper
 from conflow.results.claims import Claim
 from conflow.results.comparison import Comparison
 from conflow.results.tables import COLLISIONS, ELSEWHERE, GUARDS, METHODS, QUALITIES, READINGS, SMOOTHNESS, Cell
@@ -87,8 +88,10 @@ def _place(comparison: Comparison) -> str:
 
 
 def _reservations(comparison: Comparison) -> list[str]:
-    """Which runs are not what the others are, or were measured elsewhere."""
-    found = [comparison.code] if comparison.code else []
+    """What is missing, and which runs are not what the others are, or were measured elsewhere."""
+    missing = _missing(comparison)
+    found = [f"Of the paper's methods there is no finished run of {', '.join(missing)}"] if missing else []
+    found += [comparison.code] if comparison.code else []
     if comparison.split != "test" and any(cell.without_model for cell in comparison.cells):
         found.append("Rows without a model are of the test split.")
     if comparison.left_out:
@@ -99,6 +102,14 @@ def _reservations(comparison: Comparison) -> list[str]:
         rest = f" and {more} more" if more > 0 else ""
         found.append(f"Finished too, of other tasks, data or settings: {shown}{rest}. Compare them by their own ARGS")
     return found
+
+
+def _missing(comparison: Comparison) -> list[str]:
+    """The methods of the paper's tables that have no row, where others have one."""
+    rows = {cell.row for cell in comparison.cells if cell.table == "1"}
+    expected = [METHODS[ablation] for ablation in paper.TABLE_1 | paper.TABLE_2]
+    of_paper = comparison.task == PAPERS_TASK and not rows.isdisjoint(expected)
+    return [method for method in expected if of_paper and method not in rows]
 
 
 def _print_sheets(sheets: Iterable[Sheet], form: Format, console: Console) -> None:
@@ -149,8 +160,8 @@ def _overview(comparisons: Sequence[Comparison]) -> Sheet:
     for method in [METHODS[ablation] for ablation in HEADLINE]:
         of_row = [cells.get((method, preset)) for preset in presets]
         if any(of_row):
-            paper = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")
-            rows.append([method, paper, *(_rate(cell) if cell else "" for cell in of_row)])
+            printed = next((f"{cell.paper:.4g}" for cell in of_row if cell and cell.paper is not None), "")
+            rows.append([method, printed, *(_rate(cell) if cell else "" for cell in of_row)])
     title = f"Robot collisions without guidance, at each preset, {SPLITS[comparisons[0].split]} split"
     return title, ["", "printed in the paper", *(f"preset {one}" for one in presets)], rows
 
