@@ -352,7 +352,7 @@ def test_an_experiment_is_what_its_tasks_file_does_wherever_it_lies(task_file: P
     "argument",
     [
         *("data.horizon=20", "data.amplitudes=[0.5]", "data.jitter=0.01", "constraint.radius=0.4"),
-        *("sample.obstacle.x=0.2", "sample.obstacle.radius=0.2", "sample.radius=0.25"),
+        *("sample.obstacle.x=0.2", "sample.obstacle.radius=0.2", "sample.radius=0.25", "sample.object_radius=0.1"),
     ],
 )
 def test_settings_of_swaps_are_refused_for_other_tasks(argument: str, task_file: Path) -> None:

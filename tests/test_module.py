@@ -130,6 +130,16 @@ def test_samples_may_be_judged_at_another_distance_than_they_were_trained_for() 
     assert torch.equal(DemonstrationData(here.config).violates, DemonstrationData(model().config).violates)
 
 
+def test_robots_may_be_judged_as_points_where_they_meet_the_obstacle() -> None:
+    """They are guided around it as the discs that they are."""
+    here, x = model("sample.object_radius=0.1"), swap(500)
+    centre = torch.tensor([0.0, 0.5])
+    nearest = (x.view(500, 32, 2, 2) - centre).norm(dim=3).amin(dim=(1, 2))
+    assert torch.equal(here.judged["object"].violation(x), nearest < 0.1)
+    assert torch.equal(here.u_c_at_inference["object"](x), model().u_c_at_inference["object"](x))
+    assert torch.equal(here.judged["robot"].violation(x), model().judged["robot"].violation(x))
+
+
 def test_a_correction_may_leave_alone_what_the_source_fixes() -> None:
     u_c = model("correction.keep_ends=true").u_c(swap(100) * 0.1)  # robots near each other everywhere
     assert bool((u_c[:, [0, -1]] == 0).all())

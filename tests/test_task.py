@@ -88,7 +88,7 @@ def test_the_names_of_tasks_are_those_of_the_files_and_of_the_classes() -> None:
 
 def test_the_settings_of_swaps_arrive_in_the_task() -> None:
     arguments = ("data.horizon=20", "constraint.radius=0.4", "sample.radius=0.25", "sample.obstacle.x=0.25")
-    settings = config.load([*arguments, "data.amplitudes=[0.5]", "data.jitter=0.01"])
+    settings = config.load([*arguments, "sample.object_radius=0.125", "data.amplitudes=[0.5]", "data.jitter=0.01"])
     task = build_task(settings)
     assert isinstance(task, Swap)
     assert (task.T, task.robots.D) == (20, 4)
@@ -101,6 +101,9 @@ def test_the_settings_of_swaps_arrive_in_the_task() -> None:
     x = torch.tensor([[[0.0, 0.0, 0.3, 0.0]]])
     assert task.constraints()["robot"].violation(x).tolist() == [True]
     assert task.judged()["robot"].violation(x).tolist() == [False]
+    meets = torch.tensor([[[0.25, 0.3, 0.9, 0.9]]])
+    assert task.constraints_at_inference()["object"].violation(meets).tolist() == [True]
+    assert task.judged()["object"].violation(meets).tolist() == [False]
     # Demonstrations of a file have waypoints and robots of their own.
     other = build_task(settings, 50, 6)
     assert (other.T, other.robots.count) == (50, 3)

@@ -32,6 +32,7 @@ GUIDED = (
 )
 OPEN = (
     *("constraint.reduction", "correction.smoothing", "correction.edges", "correction.keep_ends", "correction.mask"),
-    *("network.sees_ends", "sample.solver", "sample.steps", "sample.radius", "data.amplitudes", "data.jitter"),
+    *("network.sees_ends", "sample.solver", "sample.steps", "sample.radius", "sample.object_radius"),
+    *("data.amplitudes", "data.jitter"),
 )
 """The settings by which the paper is read."""

@@ -58,6 +58,7 @@ def build_task(settings: Config, T: int | None = None, D: int = 4) -> Task:
         settings.constraint.radius,
         settings.sample.obstacle,
         settings.sample.radius,
+        settings.sample.object_radius,
         settings.data.amplitudes,
         settings.data.jitter,
     )

@@ -55,7 +55,10 @@ SIZES = (
     "sample.num",
 )
 """How much is computed: whole numbers that presets set, and that an ablation or a task may only multiply."""
-OF_SWAPS = ("data.horizon", "data.amplitudes", "data.jitter", "constraint.radius", "sample.obstacle.", "sample.radius")
+OF_SWAPS = (
+    *("data.horizon", "data.amplitudes", "data.jitter", "constraint.radius"),
+    *("sample.obstacle.", "sample.radius", "sample.object_radius"),
+)
 """Settings of SWAPS; another task has its own, `task.NAME`, or says in its file what these do."""
 MOST_NUMBERS = 64
 """The longest list that a setting may be: OmegaConf takes its time over each number."""
@@ -108,6 +111,7 @@ class Sample:
     obstacle_weight: Weight
     obstacle: Obstacle
     radius: Annotated[float | None, {"above": 0, "high": 2}]
+    object_radius: Annotated[float | None, {"above": 0, "high": 2}]
 
 
 @dataclass(frozen=True)

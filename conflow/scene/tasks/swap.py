@@ -1,6 +1,7 @@
 """The paper's task: two robots swap sides, D+ and D- (paper: "Task Description")."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ class Swap(Task):
         radius: the distance of two discs' centres at which they touch.
         obstacle: what appears at inference.
         judged_radius: the distance below which samples count as collisions; None: `radius`.
+        judged_object_radius: from the obstacle's centre, where the centre of a disc counts as in it; None: where the
+            two touch.
         amplitudes, jitter: of `swap`.
     """
 
@@ -32,6 +35,7 @@ class Swap(Task):
         radius: float = 0.3,
         obstacle: Obstacle | None = None,
         judged_radius: float | None = None,
+        judged_object_radius: float | None = None,
         amplitudes: Sequence[float] = (0.93, 0.11),
         jitter: float = 0.04,
     ) -> None:
@@ -42,7 +46,7 @@ class Swap(Task):
             )
         self.T, self.robots = T, Discs.of(D, radius / 2)
         self.judges = Discs.of(D, (judged_radius or radius) / 2)
-        self.obstacle = obstacle or Obstacle()
+        self.obstacle, self.judged_object_radius = obstacle or Obstacle(), judged_object_radius
         self.amplitudes, self.jitter = amplitudes, jitter
 
     def constraints(self) -> Mapping[str, Constraint]:
@@ -55,7 +59,11 @@ class Swap(Task):
         return {"robot": ("robot",), "obstacle": ("object",)}
 
     def judged(self) -> Mapping[str, Constraint]:
-        return {**super().judged(), "robot": RobotAvoidance(self.judges)}
+        found = {**super().judged(), "robot": RobotAvoidance(self.judges)}
+        if self.judged_object_radius is not None:
+            points, disc = Discs.of(self.robots.D, 0), replace(self.obstacle, radius=self.judged_object_radius)
+            found["object"] = ObstacleAvoidance(points, [disc])
+        return found
 
     def obstacles(self) -> Sequence[tuple[float, float, float]]:
         return [(self.obstacle.x, self.obstacle.y, self.obstacle.radius)]
