@@ -41,7 +41,7 @@ OF_TASK = "task."
 LATER: dict[str, Tree] = {
     "data": {"unrepaired": 0.0},
     "train": {"precision": "32"},
-    "sample": {"descent": 0, "guidance_steps": 4},
+    "sample": {"descent": 0, "guidance_steps": 4, "object_radius": None},
 }
 """Settings that earlier runs lack, with their defaults: here, since a planner reads no YAML."""
 SIZES = (
