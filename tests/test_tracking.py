@@ -281,18 +281,25 @@ def test_an_interrupted_run_is_found_although_one_of_its_name_has_finished_since
     assert experiment is not None
     made: list[str] = []
     for preset, status in (("long", "KILLED"), ("long", "KILLED"), ("quick", "KILLED"), ("smoke", "FINISHED")):
-        run = client.create_run(experiment.experiment_id, run_name="cgp-s0", tags={"preset": preset})
+        tags = {"preset": preset, "config_sha": f"of {preset}"}
+        run = client.create_run(experiment.experiment_id, run_name="cgp-s0", tags=tags)
         client.set_terminated(run.info.run_id, status)
         made.append(str(run.info.run_id))
-    wanted = {"long/cgp-s0": 1, "quick/cgp-s0": 2, "cgp-s0": 2, "latest": 2, made[0]: 0}
-    assert {name: str(resume.find(name).info.run_id) for name in wanted} == {
-        name: made[i] for name, i in wanted.items()
-    }
+
+    def found(asked: str) -> dict[str, int]:
+        names = ("long/cgp-s0", "quick/cgp-s0", "cgp-s0", "latest", made[0])
+        return {name: made.index(str(resume.find(name, asked).info.run_id)) for name in names}
+
+    newest = {"long/cgp-s0": 1, "quick/cgp-s0": 2, "cgp-s0": 2, "latest": 2, made[0]: 0}
+    assert found("of quick") == newest
+    assert found("of paper") == newest
+    # What was asked for goes before what is newer: two that trained side by side are resumed with "latest".
+    assert found("of long") == newest | {"cgp-s0": 1, "latest": 1}
     for ended in ("smoke/cgp-s0", made[3]):
         with pytest.raises(errors.ConfigError, match="expected an interrupted run, found one that is FINISHED"):
-            resume.find(ended)
+            resume.find(ended, "of smoke")
     with pytest.raises(errors.ConfigError, match=r"resume=logn/cgp-s0: no such run.*did you mean long/cgp-s0\?"):
-        resume.find("logn/cgp-s0")
+        resume.find("logn/cgp-s0", "of long")
 
 
 def interrupted(data: DemonstrationData) -> Run:

@@ -9,17 +9,18 @@ from conflow.tracking.recording import Experiment
 INTERRUPTED = ("KILLED", "FAILED")
 
 
-def find(wanted: str) -> Run:
+def find(wanted: str, config_sha: str) -> Run:
     """The newest interrupted run that is meant by an id, NAME, PRESET/NAME or "latest".
+
+    Where several are meant, as after a machine that trained two has stopped, one of this config is taken first.
 
     Raises:
         ConfigError: there is none, or it was not interrupted.
     """
     runs = store.runs()
     interrupted = [run for run in runs if run.info.status in INTERRUPTED]
-    for run in interrupted:
-        if store.means(wanted, run):
-            return run
+    if meant := [run for run in interrupted if store.means(wanted, run)]:
+        return next((run for run in meant if run.data.tags.get("config_sha") == config_sha), meant[0])
     for run in runs:
         if wanted != "latest" and store.means(wanted, run):
             raise ConfigError(f"resume={wanted}: expected an interrupted run, found one that is {run.info.status}")

@@ -74,7 +74,7 @@ def train(
         ranks.check_alike(asked.tags, code.files(), recording.versions())
         model = Training(ranks.of_first(lambda: fitted(config, data.known)), data.task)
         model.fit(data.known)
-        interrupted = resume.find(wanted) if wanted and first else None
+        interrupted = resume.find(wanted, asked.tags["config_sha"]) if wanted and first else None
         checkpoint = _continued(interrupted, asked, config, console, any_code) if interrupted else None
         checkpoint = ranks.of_first(lambda: checkpoint)
         console.print(understood(data), highlight=False, soft_wrap=True)
