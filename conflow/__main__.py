@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 def train(arguments: list[str]) -> None:
     """Train, sample, evaluate and track one experiment, split=val to print; or go on with one: resume=RUN, code=any."""
     from conflow import commandline
-    from conflow.tracking import signals
     from conflow.training import config, memory
 
-    signals.raise_on_signals()
     # First of all, and with little imported, so that a mistyped setting is answered at once.
     options, rest = commandline.options(arguments, {"resume": "", "code": "same", "split": "val"})
     any_code, split = _any_code(options), commandline.held_out(options)
@@ -46,10 +44,8 @@ def ablations(arguments: list[str]) -> None:
     Methods are chosen by the validation split: split=val. On a Ray cluster: cluster=auto|host:port cpus=1 gpus=0.
     """
     from conflow import commandline
-    from conflow.tracking import signals
     from conflow.training import config, memory
 
-    signals.raise_on_signals()
     defaults = {"seeds": "0 1 2", "ablations": " ".join(config.names("ablation")), "jobs": "1", "preset": "quick"}
     defaults |= {"cluster": "", "cpus": "1", "gpus": "0", "code": "same", "split": "val"}
     options, settings = commandline.options(arguments, defaults)
@@ -102,9 +98,7 @@ def _any_code(options: "Mapping[str, str]") -> bool:
 def evaluate(arguments: list[str]) -> None:
     """Sample a finished run again with other settings, and add the results: run=latest split=val sample....= seed=."""
     from conflow import commandline
-    from conflow.tracking import signals
 
-    signals.raise_on_signals()
     options, settings = commandline.options(arguments, {"run": "latest", "split": "val", "task": ""})
     split = commandline.held_out(options)
 
@@ -154,9 +148,7 @@ def sample(arguments: list[str]) -> None:
     With run=none without a model, for task=NAME.
     """
     from conflow import commandline
-    from conflow.tracking import signals
 
-    signals.raise_on_signals()
     defaults = {"run": "latest", "out": "plans.npz", "num": "64", "guidance": "all", "seed": "0", "task": ""}
     own = {"start": "", "goal": "", "obstacle": "", "via": ""} | defaults
     options, _ = commandline.options(arguments, own, settings=False)
@@ -185,9 +177,7 @@ def _task(options: "Mapping[str, str]") -> "Task | None":
 def figures(arguments: list[str]) -> None:
     """Draw the pictures of finished runs into runs/figures/: split=val, run=latest, or NAME,NAME,... to compare too."""
     from conflow import commandline
-    from conflow.tracking import signals
 
-    signals.raise_on_signals()
     options, _ = commandline.options(arguments, {"run": "latest", "split": "val", "task": ""}, settings=False)
     split = commandline.held_out(options)
 
@@ -199,10 +189,8 @@ def figures(arguments: list[str]) -> None:
 def explain(arguments: list[str]) -> None:
     """Draw why the covariant correction works, and what fewer collisions cost the published runs: preset=quick."""
     from conflow import commandline
-    from conflow.tracking import signals
     from conflow.training import config
 
-    signals.raise_on_signals()
     options, _ = commandline.options(arguments, {"preset": "quick"}, settings=False)
     settings = config.load([f"preset={options['preset']}"])
 
@@ -216,9 +204,7 @@ def explain(arguments: list[str]) -> None:
 def demonstrations(arguments: list[str]) -> None:
     """Write demonstrations for data.path, of a task= or from=TRACKS.csv agents=2 seconds=6 T=32: out= num= seed=0."""
     from conflow import commandline
-    from conflow.tracking import signals
 
-    signals.raise_on_signals()
     defaults = {"task": "swap", "from": "", "out": "NAME.npz", "num": "3000", "seed": "0"}
     tracked = {"agents": "2", "seconds": "6", "T": "32", "fps": "", "opposite": "1"}
     options, _ = commandline.options(arguments, defaults | tracked, settings=False)
@@ -231,9 +217,7 @@ def demonstrations(arguments: list[str]) -> None:
 def planbench(arguments: list[str]) -> None:
     """Solve scenes of robots or arms with models and without: task=weave n=28 scenes=64 run=NAME,NAME seed=1 num=16."""
     from conflow import commandline
-    from conflow.tracking import signals
 
-    signals.raise_on_signals()
     defaults = {"task": "weave", "n": "", "scenes": "64", "run": "", "seed": "1", "num": "16", "limit": "5"}
     defaults |= {"guided": "0", "format": "table", "reference": "0", "out": "runs/planbench"}
     options, settings = commandline.options(arguments, defaults)
@@ -295,6 +279,7 @@ def guarded(command: "Callable[[list[str]], None]", arguments: list[str]) -> Non
     """Run a command; end the process with one line where it fails in a known way."""
     from conflow.tracking import signals
 
+    signals.raise_on_signals()
     try:
         command(arguments)
         signals.check()

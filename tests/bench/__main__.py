@@ -5,13 +5,11 @@ import sys
 from conflow import commandline
 from conflow.__main__ import console, guarded
 from conflow.results import printing
-from conflow.tracking import signals
 from tests.bench import suite, table
 
 
 def bench(arguments: list[str]) -> None:
     """Measure and print, or with reference=1 print what is of record."""
-    signals.raise_on_signals()
     options, _ = commandline.options(arguments, {"format": "table", "reference": "0"}, settings=False)
     of_record = bool(commandline.whole(options, "reference", 0, 1))
     form = printing.checked_format(options["format"])

@@ -60,16 +60,16 @@ def _main(folder: Path, arguments: tuple[str, ...], death: Death | None) -> None
     main()
 
 
-def killed_in(module: str, name: str, call: int = 1) -> Death:
-    """SIGKILL at the given call of a function, before it does anything."""
-    return _Kill(module, name, call)
+def killed_in(module: str, name: str, call: int = 1, signum: signal.Signals = signal.SIGKILL) -> Death:
+    """A signal at the given call of a function, before it does anything."""
+    return _Kill(module, name, call, signum)
 
 
 class _Kill:
     """Replaces module.name by a function that kills its process; a class, so that it can be sent to a process."""
 
-    def __init__(self, module: str, name: str, call: int) -> None:
-        self.module, self.name, self.call = module, name, call
+    def __init__(self, module: str, name: str, call: int, signum: signal.Signals) -> None:
+        self.module, self.name, self.call, self.signum = module, name, call, signum
 
     def __call__(self) -> None:
         import importlib
@@ -83,7 +83,7 @@ class _Kill:
         def fatal(*positional: Any, **named: Any) -> Any:
             self.call -= 1
             if self.call == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(os.getpid(), self.signum)
             return original(*positional, **named)
 
         setattr(owner, name, fatal)

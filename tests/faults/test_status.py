@@ -53,6 +53,13 @@ def test_an_interrupted_run_is_killed_exits_with_the_signal_and_keeps_what_was_l
     assert not list((folder / "runs" / "running").iterdir())
 
 
+@pytest.mark.parametrize("command", ["compare", "reference", "ui", "figures", "evaluate"])
+def test_ctrl_c_ends_every_command_in_one_line(command: str, tmp_path: Path) -> None:
+    looks = "client" if command == "ui" else "exists"  # for the store
+    code, output = processes.run(tmp_path, command, death=killed_in("conflow.tracking.store", looks, 1, signal.SIGINT))
+    assert (code, output) == (128 + signal.SIGINT, "conflow: interrupted by SIGINT\n")
+
+
 @pytest.mark.parametrize(
     ("module", "name"),
     [
