@@ -10,6 +10,7 @@ from torch import Tensor
 from conflow.errors import ConfigError
 from conflow.flow.attention import SpectralAttention
 from conflow.flow.source import cgp
+from conflow.planner import DescentPlanner
 from conflow.scene.constraint import Barrier, Constraint, RobotAvoidance
 from conflow.scene.crowd import CrowdAvoidance, MapAvoidance
 from conflow.scene.demonstrations import check
@@ -328,3 +329,24 @@ def test_a_crowd_of_other_numbers_is_the_same_task() -> None:
     other = made.of_numbers(14)
     assert isinstance(other, CrowdTask)
     assert (other.robots.count, other.robots.radius, other.scale, other.seconds) == (7, 0.04, 3.0, 2.0)
+
+
+def test_other_numbers_of_a_crowd_keep_the_offset_of_each() -> None:
+    made = CROWDS["weave"](10)
+    made.offset = [3.0, 4.0] * 10
+    assert made.of_numbers(28).offset == [3.0, 4.0] * 14
+    assert made.of_numbers(4).offset == [3.0, 4.0] * 2
+
+
+@pytest.mark.parametrize("name", ["basic", "room"])
+def test_fewer_robots_than_a_task_has_plan_around_its_map_too(name: str) -> None:
+    """A scene's own discs went missing where its robots were fewer than the most that the task trains with."""
+    made = CROWDS[name]().in_scene(9, 1, 0)
+    assert made.robots.count > 9
+    start, goal = made.scene(9, 1, 0)
+    planner = DescentPlanner.of(made)
+    around = MapAvoidance(Crowd(9, made.radius), made.boxes())
+    for plans in (planner.plan(start, goal, num=8), planner.best_of(start, goal, num=8)):
+        clear = around.swept_clearance(plans.x).amin(dim=1) >= 0
+        assert bool(plans.feasible.any())
+        assert not bool((plans.feasible & ~clear).any())

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Self
 
 import numpy as np
 import torch
@@ -46,9 +47,11 @@ class CrowdTask(SceneTask):
     def variants(self) -> Sequence[Task]:
         return [type(self)(count, self.radius) for count in self.counts]
 
-    def of_numbers(self, D: int) -> Task:
+    def of_numbers(self, D: int) -> Self:
         made = type(self)(D // 2, self.radius)
-        made.scale, made.offset, made.seconds = self.scale, self.offset, self.seconds
+        made.scale, made.seconds = self.scale, self.seconds
+        offset = self.offset
+        made.offset = [offset[i % 2] for i in range(D)] if isinstance(offset, Sequence) else offset
         return made
 
     def constraints(self) -> Mapping[str, Constraint]:

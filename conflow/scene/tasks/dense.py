@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 
@@ -27,6 +28,11 @@ class Basic(Random):
 
     def boxes(self) -> Sequence[Box]:
         return self.map
+
+    def of_numbers(self, D: int) -> Self:
+        made = super().of_numbers(D)
+        made.map = self.map
+        return made
 
     def in_scene(self, count: int, seed: int, index: int) -> "Basic":
         made = copy.copy(self)

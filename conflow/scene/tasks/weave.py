@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 
 from conflow.scene.robots import Crowd
-from conflow.scene.task import Task
 from conflow.scene.tasks.crowd import CrowdTask
 
 REACH, SIDE = 0.8, 0.87
@@ -51,5 +51,5 @@ class ScaledWeave(Weave):
         self.scale = max(1.0, 1.001 * 0.15 * count * math.sqrt(2) / (REACH * 2 * math.pi * 0.995))
         self.robots = Crowd(count, radius / self.scale)
 
-    def of_numbers(self, D: int) -> Task:
+    def of_numbers(self, D: int) -> Self:
         return type(self)(D // 2, self.radius)
