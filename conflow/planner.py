@@ -262,7 +262,8 @@ class Planner:
 
     def of_numbers(self, D: int) -> "Planner":
         """The planner for configurations of D numbers: this one, or of a crowd the same for as many robots."""
-        return self if D == self.model.D else type(self)(self.model.of_numbers(D))
+        model = self.model.of_numbers(D)
+        return self if model is self.model else type(self)(model)
 
     def _met(self, discs: Sequence[Obstacle]) -> dict[str, Constraint]:
         """What plans are judged by: all that training keeps, and obstacles."""

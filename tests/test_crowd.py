@@ -10,7 +10,7 @@ from torch import Tensor
 from conflow.errors import ConfigError
 from conflow.flow.attention import SpectralAttention
 from conflow.flow.source import cgp
-from conflow.planner import DescentPlanner
+from conflow.planner import DescentPlanner, PlanError, Planner
 from conflow.scene.constraint import Barrier, Constraint, RobotAvoidance
 from conflow.scene.crowd import CrowdAvoidance, MapAvoidance
 from conflow.scene.demonstrations import check
@@ -22,6 +22,7 @@ from conflow.scene.tasks.weave import JITTER, PHASE
 from conflow.training import config
 from conflow.training.build import build_task, fitted
 from conflow.training.datamodule import Batches, DemonstrationData, Split
+from conflow.training.model import ConFlow
 
 crowds = pytest.mark.parametrize("task", sorted(CROWDS))
 
@@ -350,3 +351,17 @@ def test_fewer_robots_than_a_task_has_plan_around_its_map_too(name: str) -> None
         clear = around.swept_clearance(plans.x).amin(dim=1) >= 0
         assert bool(plans.feasible.any())
         assert not bool((plans.feasible & ~clear).any())
+
+
+def test_a_network_with_layers_for_one_number_of_robots_refuses_others() -> None:
+    """Training took the largest number alone, and ended in torch's traceback at the first batch of another."""
+    chosen = config.load(["task=weave", "preset=smoke"])
+    with pytest.raises(ConfigError, match=r"^network.kind=resmlp: expected robots of one number, found 10, 20, 28 in"):
+        ConFlow(chosen, build_task(chosen))
+    chosen = config.load(["task=weave", "preset=smoke", "task.robots=4"])
+    model = ConFlow(chosen, build_task(chosen))
+    start, goal = CROWDS["weave"](6).scene(6, 0, 0)
+    with pytest.raises(PlanError, match=r"found shape \(12,\), expected numbers of shape \(8,\)"):
+        Planner(model).plan(start, goal)
+    with pytest.raises(ConfigError, match=r"^task.robots=6: expected 4, for which alone this network has layers"):
+        model.on(CROWDS["weave"](6))

@@ -23,7 +23,7 @@ from conflow.flow.network import ResMLP, Spectral, SpectralMLP
 from conflow.flow.sampler import in_pieces
 from conflow.flow.source import Source
 from conflow.scene.constraint import Barrier, Constraint, Sum, Workspace
-from conflow.scene.robots import Crowd, Discs, Robots
+from conflow.scene.robots import Crowd, Discs
 from conflow.scene.task import Task
 from conflow.scene.tasks import SWAPS, TASKS
 from conflow.training import config
@@ -224,9 +224,17 @@ def build_correction(chosen: of_flow.Correction, constraint: Constraint, source:
     return Correction(constraint, smoothing)
 
 
-def build_network(chosen: of_flow.Network, source: Source, robots: Robots, constraint: Constraint) -> ResMLP | Spectral:
-    """The velocity network v_theta."""
+def build_network(chosen: of_flow.Network, source: Source, task: Task, constraint: Constraint) -> ResMLP | Spectral:
+    """The velocity network v_theta.
+
+    Raises:
+        ConfigError: it is none for these robots.
+    """
+    robots = task.robots
     if chosen.kind == "resmlp":
+        if len(counts := sorted({variant.robots.count for variant in task.variants()})) > 1:
+            found = f"found {', '.join(map(str, counts))} in turn; try task.robots={counts[-1]}, or ABLATION=plus"
+            raise ConfigError(f"network.kind=resmlp: expected robots of one number, {found}")
         return ResMLP(len(source.prior), robots.D, chosen.hidden, chosen.blocks, chosen.sees_ends)
     if chosen.kind == "spectral" and not isinstance(robots, Crowd):
         return SpectralMLP(source, robots.D, constraint, chosen.hidden, chosen.blocks)

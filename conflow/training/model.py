@@ -8,8 +8,9 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from conflow.errors import ConfigError
 from conflow.flow.correction import Correction, descend
-from conflow.flow.network import Spectral
+from conflow.flow.network import ResMLP, Spectral
 from conflow.flow.path import end, guided_path, interpolate, velocity
 from conflow.flow.sampler import Field, Push, descended, guided, guided_ahead, in_pieces, integrate
 from conflow.flow.settings import Guidance
@@ -55,7 +56,7 @@ class ConFlow(nn.Module):
         self.judged = cast(
             Mapping[str, Constraint], nn.ModuleDict({name: one.shaped(shape) for name, one in task.judged().items()})
         )
-        self.v = build_network(config.network, self.source, task.robots, labels(config, task))
+        self.v = build_network(config.network, self.source, task, labels(config, task))
         self.v.bf16 = config.train.precision == "bf16"
         self.u_c = build_correction(config.correction, kept(config, task), self.source)
         self.descending = descending(config, task, self.source)
@@ -70,13 +71,23 @@ class ConFlow(nn.Module):
         )
 
     def of_numbers(self, D: int) -> "ConFlow":
-        """The same model for configurations of D numbers, such as of more robots of a crowd: its weights, shared."""
-        if D == self.D or not isinstance(self.task.robots, Crowd):
+        """The same model for configurations of D numbers, such as of more robots of a crowd: its weights, shared.
+
+        It is this one where its robots are no crowd, or where its network is a ResMLP, which has layers for D alone.
+        """
+        if D == self.D or not isinstance(self.task.robots, Crowd) or isinstance(self.v, ResMLP):
             return self
         return self.on(self.task.of_numbers(D))
 
     def on(self, task: Task) -> "ConFlow":
-        """The same model for another task of a crowd, such as in another map: its weights, shared."""
+        """The same model for another task of a crowd, such as in another map: its weights, shared.
+
+        Raises:
+            ConfigError: its network has layers for another number of robots alone.
+        """
+        if isinstance(self.v, ResMLP) and task.robots.D != self.D:
+            expected = f"expected {self.task.robots.count}, for which alone this network has layers"
+            raise ConfigError(f"task.robots={task.robots.count}: {expected}; ABLATION=plus has one for any number")
         made = ConFlow(self.config, task)
         made.v.load_state_dict(self.v.state_dict(), assign=True)
         return made.eval()
