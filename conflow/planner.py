@@ -234,7 +234,7 @@ class Planner:
             PlanError: as `plan`.
         """
         sized, began = self._sized(start), time.monotonic()
-        sized._configurations("start", start, batch=False)
+        ends = torch.stack([sized._configurations(*end, batch=False) for end in (("start", start), ("goal", goal))])
         seed, seconds = _whole("seed", seed, low=0), _number("seconds", seconds)
         given = _items("obstacles", obstacles)  # which may be there only once
         discs = sized._discs(given)
@@ -242,7 +242,9 @@ class Planner:
         u_c = sized._descending(discs, (0, -1))
 
         def propose(draw: int) -> Tensor:
-            return sized.to_workspace(sized.plan(start, goal, num, given, seed=seed + draw, descent=0).x)
+            x = sized.to_workspace(sized.plan(start, goal, num, given, seed=seed + draw, descent=0).x)
+            x[:, [0, -1]] = sized._inside(ends)  # which on the way through the user's units may have left it by a bit
+            return x
 
         tried = (_nearest(_ranked(x[None], met)[0]) for x in looks(propose, u_c))
         for best in accumulate(tried, _better):
@@ -251,7 +253,9 @@ class Planner:
                 progress(passed, sized.length * float(best.clearance))
             if bool(best.feasible) or passed > seconds:
                 break
-        return sized._in_users_units(best)
+        found = sized._in_users_units(best)
+        found.x[:, [0, -1]] = ends
+        return found
 
     def _sized(self, start: Numbers) -> "Planner":
         """The planner for as many robots as a start (..., D) places: this one, unless its robots are a crowd."""

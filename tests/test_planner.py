@@ -866,6 +866,20 @@ def test_a_plan_without_a_model_is_found_from_each_robots_own_way(task: SceneTas
     torch.testing.assert_close(raw.sort(dim=0).values, ways.sort(dim=0).values, rtol=0, atol=1e-6)
 
 
+def test_a_start_on_the_border_of_the_users_workspace_is_planned_from() -> None:
+    """In workspace units it may be a bit outside, where no candidate was ever feasible."""
+    task = Weave(2)
+    task.scale, task.offset = 1.3, 1.1
+    flow = DescentPlanner.of(task)
+    high, low = (flow.offset + sign * flow.scale for sign in (1, -1))
+    start = torch.stack([high[0], torch.tensor(1.4), low[0], torch.tensor(0.8)])
+    assert float(flow.to_workspace(start).abs().max()) > 1
+    goal = torch.tensor([0.6, 1.4, 2.0, 0.8])
+    best = flow.best_of(start, goal, num=8, seconds=20)
+    assert best.feasible.tolist() == [True]
+    assert torch.equal(best.x[0, [0, -1]], torch.stack([start, goal]))
+
+
 def test_without_a_model_any_number_of_a_crowd_is_planned_for() -> None:
     start, goal = Weave(6).scene(6, 0, 0)
     flow = DescentPlanner.of("weave")
