@@ -2,6 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.fx.experimental import _config
 
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import guided_path, interpolate
@@ -202,6 +203,17 @@ def test_training_and_sampling_need_a_device_no_float64(ablation: list[str]) -> 
     results = [flow.sample(x_1, setting) for setting in SETTINGS]
     results += [flow.loss(x_1, M, None), flow.source.mean(flow.source.observe(x_1))]  # type: ignore[arg-type]
     assert {(result.device.type, result.dtype) for result in results} == {("meta", torch.float32)}
+
+
+@pytest.mark.parametrize("task", ["weave", "pandas", "planar_arms"])
+def test_many_robots_and_arms_train_on_a_device(task: str) -> None:
+    flow = model_of(config.load([f"task={task}", "ablation=plus", "preset=smoke", "source.fit=false"])).to("meta")
+    x_1, M = torch.zeros(8, flow.T, flow.D, device="meta"), torch.ones(8, dtype=torch.bool, device="meta")
+    with _config.patch(meta_nonzero_assume_all_nonzero=True):  # type: ignore[attr-defined]  # "meta" cannot know which
+        results = [flow.loss(x_1, M, None), flow.u_c(x_1)]  # type: ignore[arg-type]
+    assert {(result.device.type, result.dtype) for result in results} == {("meta", torch.float32)}
+    robots = flow.task.robots
+    assert robots.pullback(x_1, robots.points(x_1)).shape == x_1.shape
 
 
 def test_sampling_uses_no_autograd(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,6 +88,11 @@ class NearestPair(Bounded):
         far: in metres.
     """
 
+    arm: Tensor
+    link: Tensor
+    i: Tensor
+    j: Tensor
+
     def __init__(
         self,
         robots: Arms,
@@ -98,7 +103,7 @@ class NearestPair(Bounded):
         super().__init__(robots)
         self.far = far
         parts = [(arm, Body(body.link, part)) for arm, body in bodies for part in _parts(body.spheres)]
-        self.arm, self.link = torch.tensor([(arm, body.link) for arm, body in parts]).T
+        arm, link = torch.tensor([(arm, body.link) for arm, body in parts]).T
         # Parts with fewer spheres than another have their first one more often.
         rows = [[*body.spheres, *[body.spheres[0]] * (PART - len(body.spheres))] for _, body in parts]
         spheres = torch.tensor(rows, dtype=torch.float64)
@@ -109,16 +114,17 @@ class NearestPair(Bounded):
         kept = torch.tensor(
             [[i < j and apart(*one, *other) for j, other in enumerate(parts)] for i, one in enumerate(parts)]
         )
-        self.i, self.j = kept.any(dim=1).nonzero()[:, 0], kept.any(dim=0).nonzero()[:, 0]
+        i, j = kept.any(dim=1).nonzero()[:, 0], kept.any(dim=0).nonzero()[:, 0]
         # What need not keep apart is as good as infinitely far.
-        self.reach = (reach[:, None] + reach).where(kept, -torch.inf)[self.i][:, self.j]
+        self.reach = (reach[:, None] + reach).where(kept, -torch.inf)[i][:, j]
         # A joint that moves both of two parts as one does not change their gap.
-        lever = robots.levers(
-            self.arm.repeat_interleave(PART), self.link.repeat_interleave(PART), spheres[..., :3].flatten(0, 1)
-        )
+        lever = robots.levers(arm.repeat_interleave(PART), link.repeat_interleave(PART), spheres[..., :3].flatten(0, 1))
         lever = lever.unflatten(1, (-1, PART)).amax(dim=2)
         one_alone = (lever[:, :, None] > 0) ^ (lever[:, None] > 0)
         self.slope = (torch.maximum(lever[:, :, None], lever[:, None]) * (one_alone & kept)).amax(dim=(1, 2))
+        # What was found on an accelerator looks up in these.
+        for name, index in {"arm": arm, "link": link, "i": i, "j": j}.items():
+            self.register_buffer(name, index, persistent=False)
         self._last: Last[Contact] = Last()
 
     def clearance(self, x: Tensor) -> Tensor:
@@ -190,7 +196,7 @@ class NearestPair(Bounded):
         """The nearest spheres of so many pairs of parts at waypoints n, all (M,)."""
         i, j, N = self.i[pair // len(self.j)], self.j[pair % len(self.j)], points.shape[3]
         # Whole rows of (3, PART, M): what is near in memory is taken together.
-        each = N * torch.arange(3 * PART + 3).unflatten(0, (-1, 3)).mT[:, 1:, None]
+        each = N * torch.arange(3 * PART + 3, device=n.device).unflatten(0, (-1, 3)).mT[:, 1:, None]
         p, q = (points.flatten()[each + (one * (3 * PART + 3) * N + n)] for one in (i, j))
         radius = self.radius.to(points).mT
         gaps = _length(p[:, :, None] - q[:, None]) - (radius[:, i][:, None] + radius[:, j])
@@ -301,10 +307,12 @@ class Table(Bounded):
     What is before the second joint turns about the vertical, and stays as high as it is.
     """
 
+    lifted: Tensor
+
     def __init__(self, robots: Arms, height: float = 0.0) -> None:
         super().__init__(robots)
         self.height = height
-        self.lifted = (robots.link > 1).nonzero()[:, 0]
+        self.register_buffer("lifted", (robots.link > 1).nonzero()[:, 0], persistent=False)
         self.slope = robots.levers(robots.owner, robots.link, robots.local)[:, self.lifted].amax(dim=1)
 
     def clearance(self, x: Tensor) -> Tensor:
@@ -317,9 +325,10 @@ class Table(Bounded):
 
         def pullback(g: Tensor) -> Tensor:
             local = F.pad(robots.local.to(x)[body], (0, 1), value=1.0)
-            on = robots.frames(x)[robots.link[body], :, :, robots.owner[body], torch.arange(len(body))]
+            link, owner = robots.link.to(x.device)[body], robots.owner.to(x.device)[body]
+            on = robots.frames(x)[link, :, :, owner, torch.arange(len(body), device=x.device)]
             up = F.pad(g.reshape(-1, 1), (2, 0))
-            return robots.pull(x, robots.owner[body], robots.link[body], torch.einsum("nk,nkc->nc", local, on), up)
+            return robots.pull(x, owner, link, torch.einsum("nk,nkc->nc", local, on), up)
 
         return c.view(*x.shape[:2], 1), pullback
 

@@ -183,7 +183,8 @@ class Arms(Robots):
         arms, links = len(self.chains), self.most + 1
         on_links = x.new_zeros(2, x.shape[0] * x.shape[1], arms * links, 3)
         wrench = torch.stack([g, torch.linalg.cross(p, g)]).flatten(1, 2)
-        on_links = on_links.index_add(2, self.owner * links + self.link, wrench).unflatten(2, (arms, links))
+        which = (self.owner * links + self.link).to(x.device)
+        on_links = on_links.index_add(2, which, wrench).unflatten(2, (arms, links))
         force, moment = on_links.permute(0, 3, 4, 2, 1).flip(1).cumsum(dim=1).flip(1)[:, 1:]
         axis, origin = self.frames(x)[1:, 2:].unbind(dim=1)
         # sum (p - o_j) x g_p, with o_j taken out of the sum.
@@ -197,9 +198,9 @@ class Arms(Robots):
 
     def pull(self, x: Tensor, arm: Tensor, link: Tensor, p: Tensor, g: Tensor) -> Tensor:
         """As `pullback`, of one g (batch T, 3) for each waypoint, at a point p (batch T, 3) of a link of an arm."""
-        each = torch.arange(len(p))
+        each = torch.arange(len(p), device=p.device)
         axis, origin = (self.frames(x)[1:, k, :, arm, each] for k in (2, 3))
-        moved = torch.arange(1, self.most + 1)[:, None] <= link
+        moved = torch.arange(1, self.most + 1, device=p.device)[:, None] <= link
         torque = (axis * torch.linalg.cross(p.mT - origin, g.mT.expand_as(origin), dim=1)).sum(dim=1) * moved
         of_all = torque.new_zeros(len(self.chains), self.most, len(p))
         of_all[arm, :, each] = torque.mT

@@ -78,7 +78,7 @@ class Discs(Robots):
 
     def apart(self, x: Tensor) -> Tensor:
         """The gap between every two discs at every waypoint of x (batch, T, D), (batch, T, count, count)."""
-        p, radii = self.points(x).movedim(3, 0), self.radii.to(x.dtype)
+        p, radii = self.points(x).movedim(3, 0), self.radii.to(x)
         w_x, w_y = p[..., None] - p[..., None, :]
         return (w_x * w_x + w_y * w_y).sqrt() - (radii[:, None] + radii)
 
