@@ -6,6 +6,7 @@ from pathlib import Path
 from conflow import commandline
 from conflow.errors import ConfigError
 from conflow.scene.demonstrations import Demonstrations, save
+from conflow.scene.task import demonstrated
 from conflow.training import config
 from conflow.training.build import build_task
 
@@ -20,8 +21,7 @@ def from_task(options: Mapping[str, str]) -> str:
     num, seed = commandline.whole(options, "num", 10, 10**5), commandline.whole(options, "seed", 0, 2**32 - 1)
     settings = config.load([f"task={options['task']}"])
     out = _named(options, settings.task_name)
-    made = build_task(settings).demonstrations(num, seed)
-    save(out, made if isinstance(made, Demonstrations) else Demonstrations(made, None))
+    save(out, demonstrated(build_task(settings), num, seed))
     return f"Written: {out}; train on it with: make train ARGS=data.path={out}"
 
 

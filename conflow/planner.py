@@ -27,11 +27,10 @@ from conflow.flow.correction import Correction, descend, descent
 from conflow.flow.sampler import in_pieces, integrate
 from conflow.flow.source import Source
 from conflow.scene.constraint import Constraint, Sum
-from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.measures import leaves_workspace, smoothness
 from conflow.scene.robots import Crowd
 from conflow.scene.settings import Ball, Obstacle
-from conflow.scene.task import SceneTask, Task
+from conflow.scene.task import SceneTask, Task, demonstrated, told
 from conflow.scene.tasks import TASKS
 from conflow.training import config
 from conflow.training.build import (
@@ -40,6 +39,7 @@ from conflow.training.build import (
     REPAIR_STEPS,
     barrier,
     build_task,
+    checked,
     descending,
     fitted,
     random_stream,
@@ -438,15 +438,16 @@ class DescentPlanner(Planner):
             settings: of `config.load`, with two underscores in place of a dot, such as `correction__margin=0.05`.
 
         Raises:
-            ConfigError: there is no such task, or a setting that cannot be used.
+            ConfigError: there is no such task, it lacks something, or a setting cannot be used.
+            DemonstrationError: its demonstrations cannot be used.
         """
         name = task if isinstance(task, str) else task.name if task.name in TASKS else config.PAPERS_TASK
         given = ["ablation=plus", f"sample.descent={REPAIR_STEPS}", *config.arguments_of(settings)]
         chosen = config.load([f"task={name}", *given])
-        made = build_task(chosen) if isinstance(task, str) else task
+        made = build_task(chosen) if isinstance(task, str) else checked(task, task.name)
         if not isinstance(made, SceneTask):
-            found = made.demonstrations(FITTED_TO, chosen.data.seed)
-            chosen = fitted(chosen, found.x if isinstance(found, Demonstrations) else found)
+            found = demonstrated(made, FITTED_TO, chosen.data.seed)
+            made, chosen = told(made, found), fitted(chosen, found.x)
         return cls(ConFlow(chosen, made))
 
     def _drawn(self, source: Source, y: Tensor, noise: torch.Generator) -> Tensor:

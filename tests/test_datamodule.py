@@ -234,3 +234,61 @@ def test_a_file_of_other_waypoints_or_numbers_than_the_tasks_is_refused(
     said = rf"cart\.npz: x has shape \({shape[0]}, {shape[1]}, {shape[2]}\), expected \(N, 9, 3\), .* of task metres"
     with pytest.raises(DemonstrationError, match=said):
         DemonstrationData(settings, Metres())
+
+
+class Told(Metres):
+    """The same cart, whose demonstrations come as somebody made them."""
+
+    def __init__(self, **said: Any) -> None:
+        super().__init__()
+        self.said = said
+
+    def demonstrations(self, num: int, seed: int) -> Demonstrations:
+        return Demonstrations(**{"x": super().demonstrations(num, seed).x, **self.said})
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        (
+            {"violates": torch.arange(200) % 2},
+            r"violates holds int64 of shape \(200,\), expected bool of shape \(200,\)",
+        ),
+        (
+            {"violates": (torch.arange(200) % 2).to(torch.uint8)},
+            r"violates holds uint8 of shape \(200,\), expected bool",
+        ),
+        ({"violates": torch.ones(200)}, r"violates holds float32 of shape \(200,\), expected bool of shape \(200,\)"),
+        (
+            {"violates": torch.ones(199, dtype=torch.bool)},
+            r"violates holds bool of shape \(199,\), expected bool of sh",
+        ),
+        ({"x": torch.zeros(200, 9, 3, dtype=torch.long)}, "x holds int64, expected floating-point numbers"),
+        ({"x": None}, "x holds object, expected floating-point numbers"),
+        ({"x": [[[0.0]], [[0.0, 0.0]]]}, "setting an array element with a sequence.*, expected arrays of numbers"),
+        ({"scale": (1.0, 2.0)}, r"scale has shape \(2,\), expected \(\), finite numbers"),
+        ({"seconds": 0}, "seconds=0.0: expected a number above 0"),
+    ],
+    ids=["int64", "uint8", "float", "too few", "whole numbers", "nothing", "ragged", "two scales", "no time"],
+)
+def test_what_a_task_demonstrates_is_checked_as_a_file_is(said: dict[str, Any], reason: str) -> None:
+    """Labels of 0 and 1 would turn into D+ that is none: of whole numbers ~0 and ~1 are -1 and -2."""
+    with pytest.raises(DemonstrationError, match=f"^demonstrations of task told: {reason}") as refused:
+        DemonstrationData(config.load(["preset=smoke", "data.num=200"]), Told(**said))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_task_may_demonstrate_with_numpy(smoke: Config) -> None:
+    """In float64, and as a view that is read backwards."""
+    x = Metres().demonstrations(smoke.data.num, 0).x
+    labels = np.arange(len(x)) % 2 == 0
+    data = DemonstrationData(smoke, Told(x=x.double().numpy()[::-1], violates=labels[::-1]))
+    assert data.x.dtype == torch.float32
+    assert torch.equal(data.x, x.flip(0))
+    assert np.array_equal(data.violates.numpy(), labels[::-1])
+
+
+def test_units_and_seconds_that_a_task_demonstrates_with_hold_as_a_files_do(smoke: Config) -> None:
+    data = DemonstrationData(smoke, Told(scale=2, offset=np.array([1.0, 2.0]), seconds=8.0))
+    assert (data.task.scale, data.task.offset, data.task.seconds) == (2.0, [1.0, 2.0, 1.0], 8.0)
+    assert torch.equal(data.violates, 2 * data.x[:, -1, 0] / 8.0 > 0.2)

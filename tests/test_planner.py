@@ -23,6 +23,7 @@ from conflow.flow.sampler import PIECE
 from conflow.flow.source import Source, rbf
 from conflow.planner import DescentPlanner, PlanError, Planner, Plans, _ranked, exact
 from conflow.scene.constraint import Constraint, ObstacleAvoidance, RobotAvoidance
+from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.robots import Discs, Robots
 from conflow.scene.settings import Obstacle
 from conflow.scene.task import SceneTask, Task
@@ -898,6 +899,30 @@ def test_without_a_model_there_is_no_flow_to_guide() -> None:
         flow.plan(START, GOAL, 2, robot_weight=3)
     with pytest.raises(ConfigError, match=r"correction.margn: no such setting.*did you mean"):
         DescentPlanner.of("swap", correction__margn=0.05)
+
+
+class Line(Post):
+    """The same robot, whose straight ways come from NumPy, in other units than the task says."""
+
+    def demonstrations(self, num: int, seed: int) -> Demonstrations:  # type: ignore[override]
+        x = np.random.default_rng(seed).uniform(-1, 1, (2, num, 1, 2))
+        return Demonstrations(x[0] + np.linspace(0, 1, self.T)[:, None] * (x[1] - x[0]), scale=2.0)
+
+
+def test_a_task_of_ones_own_is_planned_for_without_a_model_as_it_is_trained() -> None:
+    flow = DescentPlanner.of(Line())
+    assert flow.scale.tolist() == [2.0, 2.0]
+    assert flow.plan((1.5, -2), (4.5, -2), 3).x.shape == (3, 16, 2)
+
+
+def test_a_task_that_lacks_something_is_refused_without_a_model_too() -> None:
+    class Nobody(Post):
+        pass
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delattr(Post, "robots")
+        with pytest.raises(ConfigError, match=r"^task=nobody: expected an attribute robots, such as conflow\.Discs"):
+            DescentPlanner.of(Nobody())
 
 
 def test_the_command_plans_without_a_model(in_process: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,6 +118,15 @@ class Mine(conflow.Task):
 """
 
 
+KEPT = (
+    COMPLETE.replace("conflow.Workspace", "Walls")
+    + """
+class Walls(conflow.Constraint):
+    def clearance(self, x): return x"""
+)
+"""With a constraint of one's own, up to what its clearance is."""
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -151,6 +160,18 @@ class Mine(conflow.Task):
         ),
         (COMPLETE + "    scale = (1.0, 2.0, 3.0)\n", "scale=(1.0, 2.0, 3.0): expected a number, or 2, one for each"),
         (
+            f"{KEPT}.norm(dim=(1, 2))\n",
+            "walls: clearance of x (2, 32, 2): found torch.float32 of shape (2,), expected floating-point",
+        ),
+        (
+            f"{KEPT}[..., 0] > 0\n",
+            "walls: clearance of x (2, 32, 2): found torch.bool of shape (2, 32), expected floating-point",
+        ),
+        (
+            f"{KEPT}[..., 0] - torch.zeros(32)\n",
+            "walls: swept_clearance of x (2, 32, 2): found RuntimeError: The size of tensor a (249) must match",
+        ),
+        (
             "from conflow.scene import constraint\n"
             + COMPLETE.replace("conflow.Workspace", "constraint.RobotAvoidance"),
             "ValueError: one robot: expected two or more",
@@ -171,6 +192,7 @@ class Mine(conflow.Task):
         *("slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
         *("long offset", "short offset", "nested offset", "empty offset", "no offset", "half an offset"),
         "long scale",
+        *("clearance of a trajectory", "clearance of yes and no", "clearance of so many waypoints"),
         "broken constraints",
         *("imported base", "imported task", "argument", "fails when made", "import"),
         *("exit", "no robot", "mistyped method", "no text"),

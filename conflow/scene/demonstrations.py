@@ -19,6 +19,8 @@ NUMBERS: dict[str, tuple[int, ...]] = {"scale": (), "offset": (2,), "seconds": (
 class Demonstrations(NamedTuple):
     """Trajectories and what their author says of them; what is None is left to the task.
 
+    A task may make it of NumPy's arrays; training sees it as `typed` says.
+
     Attributes:
         x: (N, T, D), in workspace units.
         violates: M, boolean (N,).
@@ -55,22 +57,43 @@ def load(path: str | Path) -> Demonstrations:
         raise DemonstrationError(f"data.path={path}: expected an .npz file with numeric arrays") from None
     if "x" not in arrays:
         raise DemonstrationError(f"data.path={path}: expected an array named x of shape (N, T, D)")
+    return _typed(arrays, f"data.path={path}")
+
+
+def typed(made: Demonstrations, name: str) -> Demonstrations:
+    """Demonstrations of a task's own generator as `load` gives those of a file: x in float32, plain numbers.
+
+    Raises:
+        DemonstrationError: names `name`; its arrays are not of that kind.
+    """
+    said = {key: value for key, value in made._asdict().items() if value is not None or key == "x"}
+    try:
+        arrays = {
+            key: np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value) for key, value in said.items()
+        }
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DemonstrationError(f"{name}: {error}, expected arrays of numbers") from None
+    return _typed(arrays, name)
+
+
+def _typed(arrays: Mapping[str, np.ndarray], name: str) -> Demonstrations:
+    """Demonstrations of arrays: x floating-point, `violates` boolean and as many, and numbers."""
     x, violates = arrays["x"], arrays.get("violates")
     if not np.issubdtype(x.dtype, np.floating):
-        raise DemonstrationError(f"data.path={path}: x holds {x.dtype}, expected floating-point numbers")
+        raise DemonstrationError(f"{name}: x holds {x.dtype}, expected floating-point numbers")
     if violates is not None and (violates.dtype != np.bool_ or violates.shape != x.shape[:1]):
         raise DemonstrationError(
-            f"data.path={path}: violates holds {violates.dtype} of shape {violates.shape}, "
-            f"expected bool of shape {x.shape[:1]}"
+            f"{name}: violates holds {violates.dtype} of shape {violates.shape}, expected bool of shape {x.shape[:1]}"
         )
+    # Of a view that is read backwards, or cannot be written, torch takes a copy alone.
     with np.errstate(over="ignore"):  # `check` refuses what becomes infinite
-        x = x.astype(np.float32)
-    labels = None if violates is None else torch.from_numpy(violates)
-    return Demonstrations(torch.from_numpy(x), labels, **_numbers(path, arrays))
+        x = np.require(x, np.float32, ["C", "W"])
+    labels = None if violates is None else torch.from_numpy(np.require(violates, np.bool_, ["C", "W"]))
+    return Demonstrations(torch.from_numpy(x), labels, **_numbers(name, arrays))
 
 
-def _numbers(path: str | Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Scale, offset and seconds, where a file has them."""
+def _numbers(origin: str, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Scale, offset and seconds, where they are said."""
     values = {}
     for name, shape in NUMBERS.items():
         if name not in arrays:
@@ -78,12 +101,10 @@ def _numbers(path: str | Path, arrays: Mapping[str, np.ndarray]) -> dict[str, An
         array = arrays[name]
         numeric = np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
         if array.shape != shape or not numeric or not np.isfinite(array).all():
-            raise DemonstrationError(
-                f"data.path={path}: {name} has shape {array.shape}, expected {shape}, finite numbers"
-            )
+            raise DemonstrationError(f"{origin}: {name} has shape {array.shape}, expected {shape}, finite numbers")
         values[name] = array.astype(np.float64).tolist()
         if name != "offset" and not values[name] > 0:
-            raise DemonstrationError(f"data.path={path}: {name}={values[name]}: expected a number above 0")
+            raise DemonstrationError(f"{origin}: {name}={values[name]}: expected a number above 0")
     return values
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from conflow.scene.constraint import Constraint, ObstacleAvoidance
-from conflow.scene.demonstrations import Demonstrations
+from conflow.scene.demonstrations import Demonstrations, typed
 from conflow.scene.robots import Robots
 from conflow.scene.settings import Box, Obstacle
 
@@ -80,7 +80,10 @@ class Task(ABC):
 
     @abstractmethod
     def demonstrations(self, num: int, seed: int) -> Tensor | Demonstrations:
-        """`num` trajectories x (num, T, D), a function of the seed, with labels if one has them."""
+        """`num` trajectories x (num, T, D), a function of the seed, with labels if one has them.
+
+        Called by `demonstrated`, which takes NumPy's arrays too.
+        """
 
     def variants(self) -> "Sequence[Task]":
         """Tasks whose demonstrations training sees in turn, such as with fewer robots; the last is like this one."""
@@ -117,3 +120,22 @@ class SceneTask(Task):
     @abstractmethod
     def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
         """A trajectory of each robot's own, as demonstrated, for starts and goals (num, 2, D), (num, T, D)."""
+
+
+def demonstrated(task: Task, num: int, seed: int) -> Demonstrations:
+    """What a task demonstrates, in the types that a file has.
+
+    Raises:
+        DemonstrationError: what came is not of that kind.
+    """
+    made = task.demonstrations(num, seed)
+    origin = f"demonstrations of task {task.name}"
+    return typed(made if isinstance(made, Demonstrations) else Demonstrations(made), origin)
+
+
+def told(task: Task, found: Demonstrations) -> Task:
+    """The task with the units and the time that demonstrations say, of a file or its own; the rest stays the task's."""
+    task.scale, task.seconds = found.scale or task.scale, found.seconds or task.seconds
+    if found.offset is not None:
+        task.offset = [found.offset[i % len(found.offset)] for i in range(task.robots.D)]
+    return task

@@ -146,7 +146,31 @@ def checked(task: Task, name: str) -> Task:
             if constraint not in known:
                 expected = f"expected names of constraints, {', '.join(sorted(known))}"
                 raise ConfigError(f"task={name}: setting {setting} guides around {constraint}, {expected}")
+    for one, judged in task.judged().items():
+        _check_answers(judged, torch.zeros(2, task.T, task.robots.D), f"task={name}: constraint {one}")
     return task
+
+
+def _check_answers(constraint: Constraint, x: Tensor, name: str) -> None:
+    """Refuse a constraint that does not say of trajectories x (batch, T, D) what every constraint says.
+
+    Between waypoints too: by default that asks for the clearance at many more of them.
+
+    Raises:
+        ConfigError: names what it was asked for, what came and what was expected.
+    """
+    batch, T, _ = x.shape
+    for asked, shape in (("clearance", (batch, T)), ("swept_clearance", (batch, T - 1)), ("closest", (batch,))):
+        try:
+            c = getattr(constraint, asked)(x)
+            if c.shape == shape and c.is_floating_point():
+                continue
+            found = f"{c.dtype} of shape {tuple(c.shape)}"
+        except Exception as error:  # somebody else's code may fail in any way
+            found = f"{type(error).__name__}: {brief(error)}"
+        expected = f"expected floating-point numbers of shape {shape}"
+        expected += ", from clearance at any number of waypoints" * (asked != "clearance")
+        raise ConfigError(f"{name}: {asked} of x {tuple(x.shape)}: found {found}, {expected}")
 
 
 def _fits(value: Any, D: int) -> bool:

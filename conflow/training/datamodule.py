@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, TensorDataset
 from conflow.scene import demonstrations
 from conflow.scene.demonstrations import Demonstrations
 from conflow.scene.errors import DemonstrationError
-from conflow.scene.task import Task
+from conflow.scene.task import Task, demonstrated, told
 from conflow.training.build import build_task, labels, random_stream, repaired
 from conflow.training.config import Config, SplitName
 from conflow.training.memory import check_memory
@@ -135,7 +135,7 @@ class DemonstrationData(LightningDataModule):
         whole, val, self.test = self._split()
         self.held_out: dict[SplitName, Split] = {"val": val, "test": self.test}
         variants = self.task.variants()[:-1] if config.data.path is None else []
-        others = [(task, self._made(task).x) for task in variants]
+        others = [(task, demonstrated(task, config.data.num, config.data.seed).x) for task in variants]
         if training:
             self.train, self.val = self._shown(whole, val)
             shown = [self._of_variant(x, task) for task, x in others]
@@ -159,26 +159,18 @@ class DemonstrationData(LightningDataModule):
             origin, found = f"data.path={data.path}", demonstrations.load(data.path)
             demonstrations.check(found.x, origin)
             task = task or self._task_of(found.x, origin)
-            task.scale, task.seconds = found.scale or task.scale, found.seconds or task.seconds
-            if found.offset is not None:
-                task.offset = [found.offset[i % len(found.offset)] for i in range(task.robots.D)]
         else:
             task = task or build_task(self.config)
             # The whole once more in the splits, and twice while it is generated.
             check_memory("data.num", data.num, 4 * 4 * data.num * task.T * task.robots.D)
-            origin, found = f"demonstrations of task {task.name}", self._made(task)
+            origin, found = f"demonstrations of task {task.name}", demonstrated(task, data.num, data.seed)
             demonstrations.check(found.x, origin)
         if found.x.shape[1:] != (task.T, task.robots.D):
             raise DemonstrationError(
                 f"{origin}: x has shape {tuple(found.x.shape)}, expected (N, {task.T}, {task.robots.D}), the waypoints "
                 f"and the numbers of task {task.name}"
             )
-        return origin, found, task
-
-    def _made(self, task: Task) -> Demonstrations:
-        """What a task's own generator makes."""
-        made = task.demonstrations(self.config.data.num, self.config.data.seed)
-        return made if isinstance(made, Demonstrations) else Demonstrations(made)
+        return origin, found, told(task, found)
 
     def _task_of(self, x: Tensor, origin: str) -> Task:
         """The task that the config names, for trajectories x (N, T, D) of a file."""
