@@ -447,7 +447,8 @@ class DescentPlanner(Planner):
         made = build_task(chosen) if isinstance(task, str) else checked(task, task.name)
         if not isinstance(made, SceneTask):
             found = demonstrated(made, FITTED_TO, chosen.data.seed)
-            made, chosen = told(made, found), fitted(chosen, found.x)
+            made = told(made, found.scale, found.offset, found.seconds)
+            chosen = fitted(chosen, found.x)
         return cls(ConFlow(chosen, made))
 
     def _drawn(self, source: Source, y: Tensor, noise: torch.Generator) -> Tensor:

@@ -17,6 +17,8 @@ from conflow.scene.tasks.swap import swap
 from conflow.training import config
 from conflow.training.config import Config
 from conflow.training.datamodule import Batches, DemonstrationData, Split
+from conflow.training.model_file import load_model
+from conflow.training.module import Training
 from tests.papers import label
 
 
@@ -234,6 +236,41 @@ def test_a_file_of_other_waypoints_or_numbers_than_the_tasks_is_refused(
     said = rf"cart\.npz: x has shape \({shape[0]}, {shape[1]}, {shape[2]}\), expected \(N, 9, 3\), .* of task metres"
     with pytest.raises(DemonstrationError, match=said):
         DemonstrationData(settings, Metres())
+
+
+def test_a_model_keeps_the_units_and_the_time_that_it_was_trained_with(tmp_path: Path) -> None:
+    """Of a file, so that limits to the speed are the same again; the object that one brings stays as it was."""
+    x = Metres().demonstrations(200, 0).x.numpy()
+    settings = on_file(config.load(["preset=smoke", "task=metres.py"]), tmp_path / "cart.npz", x=x, scale=3, seconds=8)
+    mine = Metres()
+    before = dict(vars(mine))
+    task = DemonstrationData(settings, mine).task
+    trained = Training(settings, task)
+    checkpoint: dict[str, Any] = {"state_dict": trained.state_dict()}
+    trained.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    loaded = load_model(tmp_path / "model.ckpt", task=mine)
+    assert (loaded.task.scale, loaded.task.seconds, loaded.task.dt) == (3.0, 8.0, 1.0)
+    x_1 = torch.from_numpy(x)
+    assert torch.equal(loaded.judged["speed"].clearance(x_1), trained.judged["speed"].clearance(x_1))
+    assert vars(mine) == before
+    assert (mine.scale, mine.seconds) == (5.0, 4.0)
+    # A file from before that was kept has the task's own time.
+    del checkpoint["conflow"]["seconds"]
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    assert load_model(tmp_path / "model.ckpt", task=mine).task.seconds == 4.0
+
+
+def test_a_task_that_computes_its_units_and_its_time_is_loaded(tmp_path: Path) -> None:
+    class Computed(Metres):
+        seconds = property(lambda self: 2.0 * self.scale)
+        scale = property(lambda self: 2.5)
+
+    trained = Training(config.load(["preset=smoke", "task=computed.py"]), Computed())
+    checkpoint: dict[str, Any] = {"state_dict": trained.state_dict()}
+    trained.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    assert load_model(tmp_path / "model.ckpt", task=Computed()).task.seconds == 5.0
 
 
 class Told(Metres):

@@ -1,8 +1,10 @@
 """What an experiment is about: robots, what they must keep, and what they learn from."""
 
+import copy
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -133,9 +135,23 @@ def demonstrated(task: Task, num: int, seed: int) -> Demonstrations:
     return typed(made if isinstance(made, Demonstrations) else Demonstrations(made), origin)
 
 
-def told(task: Task, found: Demonstrations) -> Task:
-    """The task with the units and the time that demonstrations say, of a file or its own; the rest stays the task's."""
-    task.scale, task.seconds = found.scale or task.scale, found.seconds or task.seconds
-    if found.offset is not None:
-        task.offset = [found.offset[i % len(found.offset)] for i in range(task.robots.D)]
-    return task
+def told(
+    task: Task, scale: float | Sequence[float] | None, offset: float | Sequence[float] | None, seconds: float | None
+) -> Task:
+    """A copy of the task with the units and the time that are said; of what is None, or the same, it keeps its own.
+
+    An offset for each of the plane's axes holds for every robot.
+    """
+    made = copy.copy(task)
+    if isinstance(offset, Sequence):
+        offset = [offset[i % len(offset)] for i in range(task.robots.D)]
+    for name, value in {"scale": scale, "offset": offset, "seconds": seconds}.items():
+        # A task may compute its own, and takes no other.
+        if value is not None and plain(value) != plain(getattr(task, name)):
+            setattr(made, name, value)
+    return made
+
+
+def plain(value: float | Sequence[float]) -> Any:
+    """A number of a task's, or several, as Python's own: of NumPy's kinds, or torch's, it may be too."""
+    return torch.as_tensor(value, dtype=torch.float64).tolist()

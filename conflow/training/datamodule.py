@@ -170,7 +170,7 @@ class DemonstrationData(LightningDataModule):
                 f"{origin}: x has shape {tuple(found.x.shape)}, expected (N, {task.T}, {task.robots.D}), the waypoints "
                 f"and the numbers of task {task.name}"
             )
-        return origin, found, told(task, found)
+        return origin, found, told(task, found.scale, found.offset, found.seconds)
 
     def _task_of(self, x: Tensor, origin: str) -> Task:
         """The task that the config names, for trajectories x (N, T, D) of a file."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from conflow.errors import ConfigError
-from conflow.scene.task import Task
+from conflow.scene.task import Task, told
 from conflow.scene.tasks import TASKS
 from conflow.tracking import checkpoint_file
 from conflow.training import config as configuration
@@ -26,7 +26,7 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
         path: the file.
         arguments: settings `sample....=value` and `seed=value` to sample with in place of the run's own.
         task: of a run on a task of one's own: the file of a run is not asked which code to run. A run on a task with a
-            name here knows its own, and does not take this one.
+            name here knows its own, and does not take this one. It stays as it is: the model has a copy.
 
     Raises:
         ConfigError: an argument that is none of these.
@@ -49,7 +49,7 @@ def load_model(path: Path, arguments: Sequence[str] = (), task: Task | None = No
     if task.T != T or task.robots.D != D:
         expected = f"expected T={T} and D={D}, as the run of task {config.task_name} has"
         raise TaskError(f"task={task.name}: found T={task.T} waypoints of D={task.robots.D} numbers, {expected}")
-    task.scale, task.offset = described["scale"], described["offset"]
-    model = ConFlow(config, task)
+    # Earlier files lack the seconds.
+    model = ConFlow(config, told(task, described["scale"], described["offset"], described.get("seconds")))
     model.load_state_dict(checkpoint["state_dict"])
     return model.eval()

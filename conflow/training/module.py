@@ -10,7 +10,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from conflow.errors import ConfigError
-from conflow.scene.task import Task
+from conflow.scene.task import Task, plain
 from conflow.tracking import ranks
 from conflow.training.build import random_stream
 from conflow.training.config import Config
@@ -77,15 +77,13 @@ class Training(ConFlow, LightningModule):
         torch.set_num_threads(checkpoint["conflow"]["threads"])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        # Plain numbers: of others, such as NumPy's, a file that is read without running code may hold none.
-        scale, offset = (
-            torch.as_tensor(one, dtype=torch.float64).tolist() for one in (self.task.scale, self.task.offset)
-        )
         checkpoint["conflow"] = {
             "config": self.config.tree(),
             "T": self.T,
             "D": self.D,
             "threads": torch.get_num_threads(),
-            "scale": scale,
-            "offset": offset,
+            # Plain, since a file that is read without running code may hold no others.
+            "scale": plain(self.task.scale),
+            "offset": plain(self.task.offset),
+            "seconds": plain(self.task.seconds),
         }
