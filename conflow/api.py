@@ -14,11 +14,14 @@ if TYPE_CHECKING:
 def train(task: "Task | str" = config.PAPERS_TASK, ablation: str = "cgp", **settings: Any) -> str:
     """Train, sample, evaluate and track one experiment, as `make train` does; the id of its MLflow run.
 
+    What an object was made with is no part of the record: runs of MyTask(1.0) and of MyTask(2.0) count as the same
+    experiment, and `compare` shows the newest of them. Of a file it is, as `task="my_task.py", task__limit=2.0`.
+
     Args:
         task: a task of one's own, or the name of any, or the file of one.
         ablation: the method.
         settings: `preset`, `seed`, and any other; those with a dot in their name with two underscores in its place, as
-            in `train__max_steps=100`, or `task__robots=20` of what the task is made with.
+            in `train__max_steps=100`, or, of a name or a file, `task__robots=20` of what the task is made with.
 
     Raises:
         ConfigError: a setting that cannot be used.
@@ -30,12 +33,12 @@ def train(task: "Task | str" = config.PAPERS_TASK, ablation: str = "cgp", **sett
 
     from conflow.figures.workspace import of_training
     from conflow.tracking import ranks
-    from conflow.training.build import checked
+    from conflow.training.build import of_object
     from conflow.training.memory import check_training
     from conflow.training.train import train
 
+    own = None if isinstance(task, str) else of_object(task, chosen)
     check_training(chosen)
-    own = None if isinstance(task, str) else checked(task, task.name)
     return train(chosen, Console(quiet=ranks.rank() > 0), draw=of_training, task=own)
 
 
@@ -58,10 +61,13 @@ def compare(
     import pandas as pd
 
     from conflow.results.comparison import collect
+    from conflow.training.build import of_object
 
     arguments = [*_task(task), *config.arguments_of(settings)]
-    preset = config.load(arguments).preset
-    found = collect(preset, [one for one in arguments if not one.startswith("preset=")], split)
+    chosen = config.load(arguments)
+    if not isinstance(task, str):
+        of_object(task, chosen)
+    found = collect(chosen.preset, [one for one in arguments if not one.startswith("preset=")], split)
     return pd.DataFrame(found.cells)
 
 

@@ -39,9 +39,9 @@ from conflow.training.build import (
     REPAIR_STEPS,
     barrier,
     build_task,
-    checked,
     descending,
     fitted,
+    of_object,
     random_stream,
 )
 from conflow.training.config import Range
@@ -444,7 +444,7 @@ class DescentPlanner(Planner):
         name = task if isinstance(task, str) else task.name if task.name in TASKS else config.PAPERS_TASK
         given = ["ablation=plus", f"sample.descent={REPAIR_STEPS}", *config.arguments_of(settings)]
         chosen = config.load([f"task={name}", *given])
-        made = build_task(chosen) if isinstance(task, str) else checked(task, task.name)
+        made = build_task(chosen) if isinstance(task, str) else of_object(task, chosen)
         if not isinstance(made, SceneTask):
             found = demonstrated(made, FITTED_TO, chosen.data.seed)
             made = told(made, found.scale, found.offset, found.seconds)

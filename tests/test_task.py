@@ -237,6 +237,22 @@ def test_an_object_of_a_named_task_is_refused_with_what_to_type(call: Callable[.
         call(task=build_task(config.load()))
 
 
+class Limited(TwoArms):
+    """A task that is made with something."""
+
+    def __init__(self, limit: float = 2.5) -> None:
+        self.limit = limit
+
+
+@pytest.mark.parametrize("call", [conflow.train, conflow.compare, conflow.DescentPlanner.of])
+@pytest.mark.parametrize("name", ["limit", "nonsense"])
+def test_what_a_task_is_made_with_is_refused_beside_an_object_of_it(call: Callable[..., Any], name: str) -> None:
+    """It would be recorded, and the object trained with what it has."""
+    with pytest.raises(ConfigError) as refused:
+        call(task=Limited(), **{f"task__{name}": 9.0})
+    assert str(refused.value) == f"task.{name}=9.0: expected in the task object itself, Limited(limit=...)"
+
+
 FUTURE = """
 from __future__ import annotations
 from dataclasses import dataclass

@@ -115,6 +115,19 @@ def task_of_file(path: Path, of_task: Mapping[str, Any] = MappingProxyType({})) 
         raise ConfigError(f"task={brief(path)}: {type(error).__name__}: {brief(error)}") from error
 
 
+def of_object(task: Task, settings: Config) -> Task:
+    """A task that came as an object, checked.
+
+    Raises:
+        ConfigError: what it lacks; or settings of its own beside it, which it was made without.
+    """
+    for name, value in settings.of_task.items():
+        takes = ", ".join(f"{one}=..." for one in settings_of(type(task)))
+        expected = f"expected in the task object itself, {type(task).__name__}({takes})"
+        raise ConfigError(f"task.{name}={brief(value)}: {expected}")
+    return checked(task, task.name)
+
+
 def checked(task: Task, name: str) -> Task:
     """A task, as it came, if it has what every task has.
 
