@@ -32,6 +32,7 @@ from conflow.scene.robots import Crowd
 from conflow.scene.settings import Ball, Obstacle
 from conflow.scene.task import SceneTask, Task, demonstrated, told
 from conflow.scene.tasks import TASKS
+from conflow.tracking.checkpoint_file import CheckpointError
 from conflow.training import config
 from conflow.training.build import (
     MOMENTUM,
@@ -47,7 +48,7 @@ from conflow.training.build import (
 from conflow.training.config import Range
 from conflow.training.memory import check_memory
 from conflow.training.model import ConFlow, start_and_goal
-from conflow.training.model_file import MODEL_FILE, TaskError, load_model
+from conflow.training.model_file import MODEL_FILE, load_model
 
 ALL, AROUND_OBSTACLES = "all", "obstacle"
 CHECKED, ROUNDS = 5, 12
@@ -111,21 +112,23 @@ class Planner:
 
         Raises:
             PlanError: there is no such run or file, the store cannot be used, the file is damaged or no run's
-                `model.ckpt`, or the task is missing or not the run's.
+                `model.ckpt`, or the task is missing or not the run's. What the task itself raises comes as it is.
         """
         path = _checkpoint(run)
         try:
             # Of a foreign file torch says a word of warning before it refuses it.
             with warnings.catch_warnings(action="ignore"):
                 return cls(load_model(path, task=task))
-        except FileNotFoundError:
+        except FileNotFoundError as error:
+            if error.filename != str(path):  # but one that the task reads
+                raise
             raise PlanError(f"run={run}: no such file, expected the {MODEL_FILE} of a run") from None
-        except TaskError as error:
-            raise PlanError(f"run={run}: {error}") from None
-        except Exception:  # a foreign or damaged file fails in any of a dozen ways, from EOFError to KeyError
+        except CheckpointError:
             raise PlanError(
                 f"run={run}: expected the {MODEL_FILE} of a run of this version, found a damaged or foreign file"
             ) from None
+        except ConfigError as error:
+            raise PlanError(f"run={run}: {error}") from None
 
     def plan(
         self,

@@ -683,6 +683,25 @@ def test_another_task_than_the_runs_is_refused_in_one_line(tmp_path: Path) -> No
         load_model(path, task=longer)
 
 
+@pytest.mark.parametrize("error", [ZeroDivisionError, FileNotFoundError("map.npy")])
+def test_an_error_of_a_task_of_ones_own_is_not_called_a_damaged_file(error: Any, tmp_path: Path) -> None:
+    class Broken(Post):
+        def constraints(self) -> dict[str, Constraint]:
+            raise error
+
+    path = save(ConFlow(config.load(["preset=smoke", "task=post.py"]), Post()), tmp_path / "model.ckpt")
+    with pytest.raises(error if isinstance(error, type) else type(error)):
+        Planner.load(path, Broken())
+
+
+def test_a_setting_that_a_task_no_longer_takes_is_named(tmp_path: Path) -> None:
+    model = ConFlow(config.load(["preset=smoke", "task=post.py", "task.height=2"]), Post())
+    path = save(model, tmp_path / "model.ckpt")
+    with pytest.raises(PlanError) as refused:
+        Planner.load(path, Post())
+    assert str(refused.value) == f"run={path}: task.height=2: no such setting of task post, it takes none"
+
+
 def test_a_fitted_source_is_conditioned_on_via_points_with_its_own_kernel(tmp_path: Path) -> None:
     model = model_of(fitted(config.load(["preset=smoke", "source.fit=true"]), swap(100)), T, D)
     loaded = Planner.load(save(model, tmp_path / "model.ckpt"))
