@@ -22,7 +22,8 @@ def from_task(options: Mapping[str, str]) -> str:
     settings = config.load([f"task={options['task']}"])
     out = _named(options, settings.task_name)
     save(out, demonstrated(build_task(settings), num, seed))
-    return f"Written: {out}; train on it with: make train ARGS=data.path={out}"
+    of_task = "" if settings.task == config.PAPERS_TASK else f"TASK={settings.task} "
+    return f"Written: {out}; train on it with: make train {of_task}ARGS=data.path={out}"
 
 
 def _named(options: Mapping[str, str], name: str) -> str:

@@ -19,6 +19,7 @@ from conflow.scene.measures import smoothness
 from conflow.scene.tasks import TASKS
 from conflow.scene.tasks.curves import SIDES
 from conflow.scene.tasks.passing import passing
+from conflow.scene.tasks.planar_arms import PlanarArms
 from conflow.scene.tasks.social import social
 from conflow.scene.tasks.social_force import Robots, walk
 from conflow.scene.tasks.swap import swap
@@ -361,15 +362,17 @@ def demonstrations(in_process: Typed) -> Typed:
         (("task=passing", "out=other.npz", "num=50", "seed=3"), "other.npz", passing(50, seed=3)),
         (("task=social", "num=50"), "social.npz", social(50)),
         (("task=social", "out=other.npz", "num=50", "seed=3"), "other.npz", social(50, seed=3)),
+        (("task=planar_arms", "num=10"), "planar_arms.npz", PlanarArms().demonstrations(10, 0)),
     ],
-    ids=["defaults", "passing", "social", "social elsewhere"],
+    ids=["defaults", "passing", "social", "social elsewhere", "arms"],
 )
 def test_the_command_writes_what_it_says(
     arguments: tuple[str, ...], name: str, written: Tensor, demonstrations: Typed
 ) -> None:
     code, out, err = demonstrations(*arguments)
+    task = "".join(f"TASK={one.removeprefix('task=')} " for one in arguments if one.startswith("task="))
     assert (code, err) == (0, "")
-    assert out == f"Written: {name}; train on it with: make train ARGS=data.path={name}\n"
+    assert out == f"Written: {name}; train on it with: make train {task}ARGS=data.path={name}\n"
     assert [path.name for path in Path().iterdir()] == [name]
     assert torch.equal(load(name).x, written)
 
