@@ -148,7 +148,7 @@ class Walls(conflow.Constraint):
         ),
         *(
             (COMPLETE.replace('"walls"', name), "expected a name of letters, digits, _ and -, other than torch's own")
-            for name in ('"w/alls"', '"wall.left"', '"wall (left)"', '""', '"type"', "3", "None")
+            for name in ('"w/alls"', '"wall.left"', '"wall (left)"', '""', '"type"', '"training"', "3", "None")
         ),
         (
             COMPLETE + "    def constraints_at_inference(self): return self.constraints()\n",
@@ -189,7 +189,7 @@ class Walls(conflow.Constraint):
     ids=[
         *("none", "two", "fails", "syntax", "abstract", "no robots", "no constraint", "unknown constraint"),
         *("setting none", "constraint none", "setting refined", "constraint refined"),
-        *("slash", "dot", "bracket", "empty", "torch's", "number", "None", "twice"),
+        *("slash", "dot", "bracket", "empty", "torch's", "torch's own", "number", "None", "twice"),
         *("long offset", "short offset", "nested offset", "empty offset", "no offset", "half an offset"),
         "long scale",
         *("clearance of a trajectory", "clearance of yes and no", "clearance of so many waypoints"),

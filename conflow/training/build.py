@@ -146,7 +146,7 @@ def checked(task: Task, name: str) -> Task:
         raise ConfigError(f"task={name}: expected a constraint in constraints(), found none")
     for one in (*known, *task.settings()):
         # They become parts of metrics' names, and of a torch module.
-        if not isinstance(one, str) or not re.fullmatch(r"[\w-]+", one) or hasattr(torch.nn.ModuleDict, one):
+        if not isinstance(one, str) or not re.fullmatch(r"[\w-]+", one) or hasattr(torch.nn.ModuleDict(), one):
             expected = "expected a name of letters, digits, _ and -, other than torch's own"
             raise ConfigError(f"task={name}: {brief(one)}: {expected}")
         if one in (NONE, REFINED):
