@@ -360,9 +360,12 @@ def test_each_split_is_compared_for_itself_and_named_in_every_title(
         assert f"preset smoke, {name} split" in capsys.readouterr().err.splitlines()
 
 
-def add_described(ablation: str, seed: int, *arguments: str, status: str = "FINISHED") -> None:
-    """A run that keeps its settings, as all do that are trained."""
-    run_id = add_run(ablation, seed, 20, 0.01, *arguments, status=status)
+def add_described(
+    ablation: str, seed: int, *arguments: str, status: str = "FINISHED", count: int = 20, data: str = "a"
+) -> None:
+    """A run that keeps its settings, and which `data` it learned from, as all do that are trained."""
+    run_id = add_run(ablation, seed, count, 0.01, *arguments, status=status)
+    store.client().set_tag(run_id, "data_digest", data)
     settings = config.load(["preset=smoke", f"ablation={ablation}", f"seed={seed}", *arguments])
     params = [Param(key, str(value)) for key, value in config.flatten(settings.identity()).items()]
     store.client().log_batch(run_id, params=params)
@@ -401,6 +404,26 @@ def test_finished_runs_of_other_tasks_data_and_settings_are_named(
     many = replace(found, others=[f"cgp-s{seed}" for seed in range(9)])
     assert "cgp-s5 and 3 more. Compare" in rendered(many, "markdown")
     assert "cgp-s6" not in rendered(many, "markdown")
+
+
+def test_runs_on_what_a_file_held_before_are_no_part_of_a_row_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the demonstrations that the newest run of this data learned from; other data have other ones."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    of_file = "data.path=mine.npz"
+    add_described("cgp", 0, of_file, count=900, data="old")
+    add_described("cgp", 1, of_file, count=900, data="old")
+    add_described("cgp", 1, of_file, count=10, data="new")
+    add_described("no_negatives", 0, of_file, count=30, data="new")
+    add_described("cgp", 2, "data.seed=7", data="another generator's seed")
+    found = collect("smoke", [of_file])
+    assert {ablation: len(ids) for ablation, ids in found.runs.items()} == {"cgp": 1, "no_negatives": 1}
+    counts = [one.count for one in found.cells if (one.table, one.column) == ("1", "none: robot")]
+    assert counts[:2] == [10, 30]
+    assert found.others == ["cgp-s2 data.seed=7", *(f"cgp-s{seed} {of_file} (on other data)" for seed in (1, 0))]
+    assert collect("smoke", ["data.seed=7"]).others[-1] == f"cgp-s0 {of_file}"
 
 
 def test_runs_that_were_not_measured_on_a_split_are_left_out_and_named(

@@ -21,9 +21,9 @@ VALIDATED = {"validation/": "test/", EVALUATED_ON_VALIDATION: "evaluate/"}
 """How metrics of the validation split begin, and those of the test split that they correspond to."""
 SUCCESS = re.compile(r"/success_(rate|low|high|count)$")
 ORIGIN = ("code_sha", "code", "git_sha", "git_dirty", "data_digest", "versions", "hardware", "threads", "resumed")
-
-
 PRECISION = "train.precision"
+DEMONSTRATED = ("data.path", "data.num", "data.horizon", "data.amplitudes", "data.jitter", "data.seed")
+"""The settings that decide what is demonstrated; other ones of `data` say what is learned of it."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,17 @@ class Record:
         own = f"{self.ablation}-s{self.seed}"
         return own if self.task == PAPERS_TASK else f"{self.task}-{own}"
 
+    @property
+    def digest(self) -> str | None:
+        """The fingerprint of the demonstrations."""
+        return self.origin.get("data_digest")
+
+    @property
+    def demonstrated(self) -> str:
+        """The settings of which the demonstrations follow, but for what a file holds, as text."""
+        made_by = (*DEMONSTRATED, "constraint.radius")  # at which some generators let robots touch
+        return str({key: value for key, value in self.settings.items() if key.startswith("task") or key in made_by})
+
     @cached_property
     def changes(self) -> list[str]:
         """The settings that are not those of the task and the ablation at the preset, as arguments."""
@@ -150,8 +161,12 @@ def finished(preset: str) -> list[Run]:
 
 
 def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
-    """The first of the `finished` runs of every ablation and seed at a preset, with arguments as they were trained."""
+    """The first of the `finished` runs of every ablation and seed at a preset, with arguments as they were trained.
+
+    All on the same demonstrations, those of the first: a file's, or a generator's, may have changed between two runs.
+    """
     newest: dict[tuple[str, int], Record] = {}
+    digests: dict[str, str | None] = {}
     for run in finished(preset):
         ablation, seed = run.data.tags["ablation"], int(run.data.tags["seed"])
         if ablation not in config.names("ablation"):
@@ -161,21 +176,25 @@ def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
         except ConfigError:
             continue  # the arguments do not go with this ablation, so nobody has trained it with them
         if run.data.tags["config_sha"] == asked.sha():
-            newest.setdefault((ablation, seed), Record.of(run))
+            one = Record.of(run)
+            if digests.setdefault(one.demonstrated, one.digest) == one.digest:
+                newest.setdefault((ablation, seed), one)
     return sorted(newest.values(), key=lambda record: record.seed)
 
 
 def others(preset: str, shown: Sequence[Record]) -> list[str]:
     """The finished runs at a preset that are of other tasks, data or settings than those shown, by name and change."""
     ids = {run.run_id for run in shown}
-    known = {(run.ablation, run.seed, str(run.settings)) for run in shown}
+    known = {(run.ablation, run.seed, str(run.settings), run.digest) for run in shown}
+    digests = {run.demonstrated: run.digest for run in shown}
     found: dict[str, None] = {}
     for run in store.runs("FINISHED", preset=preset):
         one = Record.of(run)
-        if one.run_id in ids or (one.ablation, one.seed, str(one.settings)) in known:
+        if one.run_id in ids or (one.ablation, one.seed, str(one.settings), one.digest) in known:
             continue
+        elsewhere = ["(on other data)"] if digests.get(one.demonstrated, one.digest) != one.digest else []
         try:
-            found[" ".join([one.name, *one.changes])] = None
+            found[" ".join([one.name, *one.changes, *elsewhere])] = None
         except ConfigError:
             found[one.name] = None
     return list(found)

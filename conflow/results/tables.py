@@ -315,7 +315,7 @@ def _mean(metric: str, runs: Sequence[Record]) -> tuple[None, float, Interval, I
 
 def scores(metric: str, runs: Sequence[Record]) -> dict[Seed, Score]:
     """What each run reached, on the scale of the tests."""
-    return {(run.seed, run.origin.get("data_digest")): _score(metric, run) for run in runs}
+    return {(run.seed, run.digest): _score(metric, run) for run in runs}
 
 
 def _score(metric: str, run: Record) -> Score:
