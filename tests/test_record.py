@@ -269,7 +269,11 @@ def test_readings_of_another_task_show_its_own_collisions() -> None:
     shown = {cell.column: cell.count for cell in tables({}, {"a reading": [Record.read(path)]})}
     assert shown["none: arms"] == Record.read(path).metrics["test/none/arms_collision_count"]
     assert shown["all: speed"] == Record.read(path).metrics["test/all/speed_collision_count"]
-    assert {"none: success", "smoothness, median"} <= shown.keys()
+    settings = [column.removesuffix(": success") for column in shown if column.endswith(": success")]
+    assert settings[0] == "none"
+    assert {*settings} == {column.split(": ")[0] for column in shown if ": arms" in column}
+    assert shown["all: success"] == Record.read(path).metrics["test/all/success_count"]
+    assert "smoothness, median" in shown
     assert "none: robot" not in shown
 
 
@@ -287,8 +291,9 @@ def test_the_command_of_a_row_stands_beside_it() -> None:
     assert found.commands["ConFlow (D+ and D-), sample.solver:rk4"] == (
         f"{train} && for s in 0 1; do make evaluate RUN=quick/cgp-s$s SPLIT=test ARGS='sample.solver=rk4'; done"
     )
-    (other,) = (command for command in found.commands.values() if "amplitudes" in command)
+    other, again = (command for command in found.commands.values() if "amplitudes" in command)
     assert other == f"{train} ARGS='data.amplitudes=[0.9,0.15] data.jitter=0.05'"
+    assert again.startswith(f"{other} && for s in 0 1; do make evaluate")
     console = Console(width=400)
     with console.capture() as captured:
         printing.render([found], "markdown", console)
@@ -512,3 +517,19 @@ def test_a_row_that_was_sampled_again_is_of_the_seeds_that_were() -> None:
     row = "plus: the best together, sample.solver:rk4"
     assert (cell(found, "4", row, "none: robot").seeds, cell(found, "4", row, "none: robot").count) == (1, 5)
     assert "for s in 0; do make evaluate" in found.commands[row]
+
+
+def test_a_changed_run_that_was_sampled_again_has_a_row_for_each() -> None:
+    """In the table of what is changed, each beside the command that trains it so and then samples it so."""
+    for seed in range(2):
+        published("cgp", seed, 30, "constraint.reduction=closest")
+        published("plus", seed, 5, "data.seed=101")
+    (found,) = comparison.collect_reference()
+    for table, row, count in (
+        ("4", "ConFlow (D+ and D-), constraint.reduction=closest", 60),
+        ("5", "plus: the best together, data.seed=101", 10),
+    ):
+        again = f"{row}, sample.solver:rk4"
+        assert [cell(found, table, name, "none: robot").count for name in (row, again)] == [count, count]
+        assert found.commands[again].startswith(f"{found.commands[row]} && for s in 0 1; do make evaluate RUN=quick/")
+        assert found.commands[again].endswith("-s$s SPLIT=test ARGS='sample.solver=rk4'; done")

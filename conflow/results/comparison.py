@@ -213,10 +213,10 @@ def _commands(
     runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]], split: SplitName
 ) -> dict[str, str]:
     """What makes each row again, by the row's name."""
-    found = {name: _command(of_row) for name, of_row in readings.items()}
-    for ablation, of_row in runs.items():
-        name, again = METHODS.get(ablation, ablation), _command(of_row)
-        found |= {name: again, f"{BASELINE}source {ablation}": again}
+    found = {f"{BASELINE}source {ablation}": _command(of_row) for ablation, of_row in runs.items()}
+    methods = {METHODS.get(ablation, ablation): of_row for ablation, of_row in runs.items()}
+    for name, of_row in {**methods, **readings}.items():
+        again = found[name] = _command(of_row)
         for label in labels(of_row):
             seeds = " ".join(str(one.seed) for one in labelled(of_row, label))
             arguments = "" if label == UNCHANGED else f" ARGS='{label.replace(':', '=')}'"

@@ -199,12 +199,11 @@ def _table_3(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
 
 def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> list[Cell | None]:
     """ConFlow under other readings: trained with them, or, where that is enough, sampled and judged again with them."""
-    rows = [("default", "test/", runs.get("cgp", [])), *((name, "test/", of_row) for name, of_row in readings.items())]
+    rows = [("default", "test/", runs.get("cgp", []))]
+    for name, of_row in readings.items():
+        rows += [(name, "test/", of_row), *_sampled_again(name, of_row)]
     for name, of_row in runs.items():
-        rows += [
-            (f"{METHODS.get(name, name)}, {label}", f"evaluate/{label}/", labelled(of_row, label))
-            for label in labels(of_row)
-        ]
+        rows += _sampled_again(METHODS.get(name, name), of_row)
     if len(rows) == 1:
         return []
     return [
@@ -214,13 +213,19 @@ def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Recor
     ]
 
 
+def _sampled_again(name: str, of_row: Sequence[Record]) -> list[tuple[str, str, list[Record]]]:
+    """A row for each settings that runs were sampled with again: its name, how its metrics begin, and its runs."""
+    return [(f"{name}, {label}", f"evaluate/{label}/", labelled(of_row, label)) for label in labels(of_row)]
+
+
 def _of_readings(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
-    """The columns of Table 4; of another task than a swap all its collisions, and success."""
+    """The columns of Table 4; of another task than a swap all its collisions, and success in every setting."""
     columns = collisions(runs)
     if columns is COLLISIONS:
         return READINGS
     own = {metric.removeprefix("test/"): column for metric, column in columns.items()}
-    return own | {"none/success": "none: success"} | ALSO_READ
+    settings = dict.fromkeys(metric.split("/")[0] for metric in own)
+    return own | {f"{setting}/success": f"{setting}: success" for setting in settings} | ALSO_READ
 
 
 def _on_other_data(run: Record) -> bool:
@@ -232,7 +237,11 @@ def _table_5(elsewhere: Mapping[str, list[Record]]) -> list[Cell | None]:
     """Methods on other demonstrations, each set with its own D+ below."""
     cells = []
     for name, of_row in elsewhere.items():
-        cells += [cell("5", name, column, None, metric, of_row) for metric, column in ELSEWHERE.items()]
+        for row, prefix, measured in [(name, "test/", of_row), *_sampled_again(name, of_row)]:
+            cells += [
+                cell("5", row, column, None, metric.replace("test/", prefix), measured)
+                for metric, column in ELSEWHERE.items()
+            ]
         demonstrations = f"{BASELINE}feasible, {' '.join(of_row[0].changes)}"
         for metric, column in ELSEWHERE.items():
             if metric.startswith("test/none/"):
