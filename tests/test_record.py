@@ -164,6 +164,17 @@ def test_records_of_several_tasks_are_compared_apart(folder: Path) -> None:
         assert all((f"TASK={one.task}" in again) == (one.task != "swap") for again in one.commands.values())
 
 
+@pytest.mark.parametrize("task", ["passing", "social"])
+def test_the_papers_numbers_stand_beside_its_own_task_alone(task: str) -> None:
+    for of_task in (task, "swap"):
+        for ablation in ("cgp", "gaussian"):
+            published(ablation, 0, 20, f"task={of_task}")
+    swap, other = comparison.collect_reference()
+    assert {one.table for one in other.cells} >= {"1", "2"}
+    assert {one.table for one in swap.cells if one.paper is not None} == {"1", "2"}
+    assert [one for one in other.cells if one.paper is not None] == []
+
+
 def test_every_format_says_of_which_task_a_number_is() -> None:
     """And the overview is of the paper's alone: no column of it is another task's."""
     for preset in ("long", "quick"):

@@ -3,7 +3,7 @@
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -170,9 +170,7 @@ def _table_1(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     cells = []
     columns = collisions(runs)
     for ablation, by_seed in runs.items():
-        of_paper = by_seed[0].task == PAPERS_TASK
-        printed = itertools.chain(paper.TABLE_1.get(ablation, ()) if of_paper else (), itertools.repeat(None))
-        for (metric, column), number in zip(columns.items(), printed, strict=False):
+        for (metric, column), number in zip(columns.items(), _printed(paper.TABLE_1, by_seed), strict=False):
             cells.append(cell("1", METHODS.get(ablation, ablation), column, number, metric, by_seed))
     return cells + _without_model("1", columns, runs)
 
@@ -182,10 +180,16 @@ def _table_2(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     if collisions(runs) is not COLLISIONS:
         return cells
     for ablation in [name for name in paper.TABLE_2 if name in runs]:
-        printed = itertools.chain(paper.TABLE_2[ablation], itertools.repeat(None))
-        for (metric, row), number in zip((QUALITIES | SMOOTHNESS).items(), printed, strict=False):
+        numbers = _printed(paper.TABLE_2, runs[ablation])
+        for (metric, row), number in zip((QUALITIES | SMOOTHNESS).items(), numbers, strict=False):
             cells.append(cell("2", row, METHODS[ablation], number, metric, runs[ablation]))
     return cells
+
+
+def _printed(numbers: Mapping[str, Sequence[float]], by_seed: Sequence[Record]) -> Iterator[float | None]:
+    """The paper's numbers for a method, and none after them; of another task than its own there is none."""
+    of_paper = by_seed[0].task == PAPERS_TASK
+    return itertools.chain(numbers.get(by_seed[0].ablation, ()) if of_paper else (), itertools.repeat(None))
 
 
 def _table_3(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
