@@ -426,6 +426,30 @@ def test_runs_on_what_a_file_held_before_are_no_part_of_a_row_and_named(
     assert collect("smoke", ["data.seed=7"]).others[-1] == f"cgp-s0 {of_file}"
 
 
+def test_rows_of_changed_runs_say_what_is_changed_and_are_not_held_against_the_paper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their claims are still about methods; a change of precision alone is none."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    change = "correction.lambda_c=99.0"
+    for seed in range(2):
+        for ablation, count in (("cgp", 900), ("gaussian", 990)):
+            add_described(ablation, seed, change, count=count)
+        add_described("cgp", seed, "train.precision=bf16")
+    found = collect("smoke", ["correction.lambda_c=99"])
+    names = {one.column if one.table == "2" else one.row for one in found.cells}
+    assert names >= {f"{name}, {change}" for name in ("ConFlow (D+ and D-)", "no model: source gaussian")}
+    assert [name for name in names if not name.endswith(change)] == []
+    assert names <= found.commands.keys()
+    assert {(one.paper, one.differs) for one in found.cells} == {(None, None)}
+    assert found.reasons == {}
+    claims = {claim.text: claim for claim in found.claims}
+    assert claims["CGP beats Gaussian: collision rate"].verdict == "holds"
+    in_bf16 = cell(collect("smoke", ["train.precision=bf16"]), "1", "ConFlow (D+ and D-)", "none: robot")
+    assert in_bf16.paper == 0.016
+
+
 def test_runs_that_were_not_measured_on_a_split_are_left_out_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,7 @@ from conflow.errors import ConfigError
 from conflow.results import paper, records
 from conflow.results.claims import Claim, claims
 from conflow.results.records import Record
-from conflow.results.tables import BASELINE, COLLISIONS, METHODS, Cell, labelled, labels, tables
+from conflow.results.tables import BASELINE, COLLISIONS, METHODS, Cell, labelled, labels, method, named, tables
 from conflow.tracking import code, store
 from conflow.training import config
 from conflow.training.config import PAPERS_TASK, SPLITS, SplitName
@@ -213,8 +213,8 @@ def _commands(
     runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]], split: SplitName
 ) -> dict[str, str]:
     """What makes each row again, by the row's name."""
-    found = {f"{BASELINE}source {ablation}": _command(of_row) for ablation, of_row in runs.items()}
-    methods = {METHODS.get(ablation, ablation): of_row for ablation, of_row in runs.items()}
+    found = {named(f"{BASELINE}source {ablation}", of_row): _command(of_row) for ablation, of_row in runs.items()}
+    methods = {method(ablation, of_row): of_row for ablation, of_row in runs.items()}
     for name, of_row in {**methods, **readings}.items():
         again = found[name] = _command(of_row)
         for label in labels(of_row):
@@ -225,9 +225,10 @@ def _commands(
             evaluated = f"for s in {seeds}; do make evaluate RUN={run} SPLIT={split}{arguments}; done"
             found[f"{name}, {label}"] = f"{again} && {evaluated}"
     if "cgp" in runs:
-        found["default"] = _command(runs["cgp"])
+        found[named("default", runs["cgp"])] = _command(runs["cgp"])
     for of_row in list(runs.values())[:1]:
-        found |= dict.fromkeys((f"{BASELINE}test data", f"{BASELINE}feasible test data"), _command(of_row[:1]))
+        data = [named(f"{BASELINE}{name}", of_row) for name in ("test data", "feasible test data")]
+        found |= dict.fromkeys(data, _command(of_row[:1]))
     return found
 
 

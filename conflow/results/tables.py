@@ -156,6 +156,16 @@ def tables(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]
     return [cell for cell in cells if cell is not None]
 
 
+def named(name: str, runs: Sequence[Record]) -> str:
+    """A row's name, of changed runs with what is changed about them."""
+    return name if not runs or runs[0].of_preset else f"{name}, {' '.join(runs[0].changes)}"
+
+
+def method(ablation: str, runs: Sequence[Record]) -> str:
+    """The name of a method's row."""
+    return named(METHODS.get(ablation, ablation), runs)
+
+
 def collisions(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
     """The columns of collision rates: the paper's, or of another task's each setting with each constraint."""
     every = [run for by_seed in runs.values() for run in by_seed]
@@ -171,7 +181,7 @@ def _table_1(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     columns = collisions(runs)
     for ablation, by_seed in runs.items():
         for (metric, column), number in zip(columns.items(), _printed(paper.TABLE_1, by_seed), strict=False):
-            cells.append(cell("1", METHODS.get(ablation, ablation), column, number, metric, by_seed))
+            cells.append(cell("1", method(ablation, by_seed), column, number, metric, by_seed))
     return cells + _without_model("1", columns, runs)
 
 
@@ -182,19 +192,19 @@ def _table_2(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     for ablation in [name for name in paper.TABLE_2 if name in runs]:
         numbers = _printed(paper.TABLE_2, runs[ablation])
         for (metric, row), number in zip((QUALITIES | SMOOTHNESS).items(), numbers, strict=False):
-            cells.append(cell("2", row, METHODS[ablation], number, metric, runs[ablation]))
+            cells.append(cell("2", row, method(ablation, runs[ablation]), number, metric, runs[ablation]))
     return cells
 
 
 def _printed(numbers: Mapping[str, Sequence[float]], by_seed: Sequence[Record]) -> Iterator[float | None]:
-    """The paper's numbers for a method, and none after them; of another task than its own there is none."""
-    of_paper = by_seed[0].task == PAPERS_TASK
+    """The paper's numbers for a method, and none after them; of another task or changed settings there is none."""
+    of_paper = by_seed[0].task == PAPERS_TASK and by_seed[0].of_preset
     return itertools.chain(numbers.get(by_seed[0].ablation, ()) if of_paper else (), itertools.repeat(None))
 
 
 def _table_3(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
     cells = [
-        cell("3", METHODS.get(ablation, ablation), column, None, metric, by_seed)
+        cell("3", method(ablation, by_seed), column, None, metric, by_seed)
         for ablation, by_seed in runs.items()
         for metric, column in GUARDS.items()
     ]
@@ -203,11 +213,11 @@ def _table_3(runs: Mapping[str, list[Record]]) -> list[Cell | None]:
 
 def _table_4(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]]) -> list[Cell | None]:
     """ConFlow under other readings: trained with them, or, where that is enough, sampled and judged again with them."""
-    rows = [("default", "test/", runs.get("cgp", []))]
+    rows = [(named("default", runs.get("cgp", [])), "test/", runs.get("cgp", []))]
     for name, of_row in readings.items():
         rows += [(name, "test/", of_row), *_sampled_again(name, of_row)]
     for name, of_row in runs.items():
-        rows += _sampled_again(METHODS.get(name, name), of_row)
+        rows += _sampled_again(method(name, of_row), of_row)
     if len(rows) == 1:
         return []
     return [
@@ -259,6 +269,7 @@ def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, li
     every = [run for by_seed in runs.values() for run in by_seed]
     rows = [(f"source {name}", "source", runs[name]) for name in SOURCES if name in runs]
     rows += [("test data", "data", every), ("feasible test data", "feasible", every)]
+    rows = [(named(row, of_row), group, of_row) for row, group, of_row in rows]
     cells = []
     for row, group, of_row in rows:
         for metric, column in columns.items():
