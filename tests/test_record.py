@@ -464,6 +464,35 @@ def test_what_is_published_is_what_the_store_has(folder: Path) -> None:
     assert made.changes == []
 
 
+def finished_run(count: int, *arguments: str, ablation: str = "cgp") -> None:
+    """A finished run in the store, of these settings but for an ablation whose file is none here."""
+    client = store.client()
+    experiment = client.get_experiment_by_name("conflow")
+    assert experiment is not None
+    settings = load(["preset=smoke", *arguments])
+    tags = {"ablation": ablation, "preset": "smoke", "seed": "0", "config_sha": settings.sha()} | code.tags()
+    run_id = client.create_run(experiment.experiment_id, tags=tags).info.run_id
+    for key, value in flatten(settings.identity()).items():
+        client.log_param(run_id, key, str(value))
+    client.log_metric(run_id, "test/none/num", count)
+    client.set_terminated(run_id, "FINISHED")
+
+
+def test_the_newest_run_of_a_name_is_published_though_its_task_was_edited(folder: Path) -> None:
+    """Whose code is in the fingerprint of the config and in no file's name."""
+    for count, text in ((10, "x = 1\n"), (20, "x = 2\n")):
+        (folder / "my_task.py").write_text(text)
+        finished_run(count, "task=my_task.py")
+    (path,) = records.publish("smoke")
+    assert Record.read(path).metrics == {"test/none/num": 20}
+
+
+def test_a_run_of_an_ablation_that_is_gone_keeps_no_other_from_being_published(folder: Path) -> None:
+    finished_run(10)
+    finished_run(20, "train.max_steps=7", ablation="mine")
+    assert [path.name for path in records.publish("smoke")] == ["cgp-smoke-s0.json"]
+
+
 def test_what_a_run_from_before_called_success_is_not_mixed_with_what_it_is_now(folder: Path) -> None:
     """Before runs were measured on the validation split, success ignored the obstacle."""
     client = store.client()

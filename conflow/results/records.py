@@ -74,11 +74,8 @@ class Record:
 
     def write(self, folder: Path) -> Path:
         """The file of this record in a folder; where one of another run of the same experiment was, it is replaced."""
-        parts = [*([] if self.task == PAPERS_TASK else [self.task]), self.ablation, self.preset, *self.changes]
-        # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
-        name = re.sub(r"[^\w.=+-]+", "_", "-".join([*parts, f"s{self.seed}"]))
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{name}.json"
+        path = folder / self.file
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
         return path
 
@@ -108,6 +105,13 @@ class Record:
         """The run's."""
         own = f"{self.ablation}-s{self.seed}"
         return own if self.task == PAPERS_TASK else f"{self.task}-{own}"
+
+    @property
+    def file(self) -> str:
+        """The name of the file that it is written to, which says all that `changes` does."""
+        parts = [*([] if self.task == PAPERS_TASK else [self.task]), self.ablation, self.preset, *self.changes]
+        # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
+        return re.sub(r"[^\w.=+-]+", "_", "-".join([*parts, f"s{self.seed}"])) + ".json"
 
     @property
     def digest(self) -> str | None:
@@ -156,8 +160,13 @@ class Record:
 
 
 def finished(preset: str) -> list[Run]:
-    """The finished runs at a preset, those of the present code first, the newest of either first."""
-    return sorted(store.runs("FINISHED", preset=preset), key=lambda run: bool(code.differing(run.data.tags)))
+    """The finished runs at a preset, those of the present code first, the newest of either first.
+
+    But for those of an ablation whose file is gone, of which nobody can say what was changed.
+    """
+    known = config.names("ablation")
+    runs = [run for run in store.runs("FINISHED", preset=preset) if run.data.tags["ablation"] in known]
+    return sorted(runs, key=lambda run: bool(code.differing(run.data.tags)))
 
 
 def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
@@ -169,8 +178,6 @@ def from_store(preset: str, arguments: Sequence[str] = ()) -> list[Record]:
     digests: dict[str, str | None] = {}
     for run in finished(preset):
         ablation, seed = run.data.tags["ablation"], int(run.data.tags["seed"])
-        if ablation not in config.names("ablation"):
-            continue
         try:
             asked = config.load([f"ablation={ablation}", f"preset={preset}", f"seed={seed}", *arguments])
         except ConfigError:
@@ -214,8 +221,12 @@ def from_files() -> list[Record]:
 
 
 def publish(preset: str) -> list[Path]:
-    """Write the first of the `finished` runs of every experiment and seed at a preset into runs/reference/."""
-    newest: dict[str, Run] = {}
-    for run in finished(preset):
-        newest.setdefault(run.data.tags["config_sha"], run)
-    return [Record.of(run).write(FOLDER) for run in newest.values()]
+    """Write the first of the `finished` runs of every experiment and seed at a preset into runs/reference/.
+
+    What has one file's name is one experiment, though its config may have another fingerprint, as where a task's file
+    was edited.
+    """
+    newest: dict[str, Record] = {}
+    for one in map(Record.of, finished(preset)):
+        newest.setdefault(one.file, one)
+    return [one.write(FOLDER) for one in newest.values()]
