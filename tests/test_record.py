@@ -547,6 +547,17 @@ def test_a_method_on_other_demonstrations_has_a_table_of_its_own_with_their_d_pl
     assert found.commands[row] == "make ablations ABLATIONS=plus SEEDS=\"0 1\" PRESET=quick ARGS='data.seed=101'"
 
 
+@pytest.mark.parametrize("change", ["data.negative_share=0.5", "data.val_fraction=0.2", "data.negatives=false"])
+def test_what_is_learned_of_the_same_demonstrations_is_a_reading(change: str) -> None:
+    published("cgp", 0, 30, change)
+    published("cgp", 0, 40, change, "data.seed=7")
+    published("cgp", 0, 50, "data.num=500", "data.seed=7")
+    (found,) = comparison.collect_reference()
+    rows = {table: {one.row for one in found.cells if one.table == table} for table in "45"}
+    assert [len(rows["4"]), len(rows["5"])] == [4, 2], "each as trained and as sampled again"
+    assert all("data.num" in row for row in rows["5"])
+
+
 def test_a_row_that_was_sampled_again_is_of_the_seeds_that_were() -> None:
     """One of two networks sampled with other settings is a row of one seed, and not none."""
     published("plus", 0, 5)

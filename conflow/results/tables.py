@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from conflow.results import paper, statistics
-from conflow.results.records import Record
+from conflow.results.records import DEMONSTRATED, Record
 from conflow.results.statistics import Score, Seed
 from conflow.training.config import PAPERS_TASK, SWAPS
 from conflow.training.metrics import wilson
@@ -243,8 +243,8 @@ def _of_readings(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
 
 
 def _on_other_data(run: Record) -> bool:
-    """Whether all that is changed about a run is what it learned from."""
-    return all(change.startswith("data.") for change in run.changes)
+    """Whether all that is changed about a run is what was demonstrated, and not what it made of that."""
+    return all(change.partition("=")[0] in DEMONSTRATED for change in run.changes)
 
 
 def _table_5(elsewhere: Mapping[str, list[Record]]) -> list[Cell | None]:
