@@ -558,6 +558,19 @@ def test_what_is_learned_of_the_same_demonstrations_is_a_reading(change: str) ->
     assert all("data.num" in row for row in rows["5"])
 
 
+def test_what_no_model_touched_of_other_demonstrations_is_there_once() -> None:
+    """However many methods learned from them, and of one that measured it."""
+    for ablation in ("cgp", "plus", "descent"):
+        made = published(ablation, 0, 5, "data.seed=101")
+        if ablation != "cgp":
+            feasible = {"without_model/feasible/num": 400, "without_model/feasible/near_count": 100}
+            replace(made, metrics=made.metrics | feasible).write(records.FOLDER)
+    (found,) = comparison.collect_reference()
+    assert cell(found, "5", "no model: feasible, data.seed=101", "near rate").trajectories == 400
+    keys = [(one.table, one.row, one.column) for one in found.cells]
+    assert len(keys) == len(set(keys))
+
+
 def test_a_row_that_was_sampled_again_is_of_the_seeds_that_were() -> None:
     """One of two networks sampled with other settings is a row of one seed, and not none."""
     published("plus", 0, 5)

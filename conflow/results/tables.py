@@ -248,19 +248,19 @@ def _on_other_data(run: Record) -> bool:
 
 
 def _table_5(elsewhere: Mapping[str, list[Record]]) -> list[Cell | None]:
-    """Methods on other demonstrations, each set with its own D+ below."""
-    cells = []
+    """Methods on other demonstrations, each set with its own D+ below the first of them."""
+    cells: list[Cell | None] = []
+    every: dict[str, list[Record]] = {}
+    for of_row in elsewhere.values():
+        every.setdefault(" ".join(of_row[0].changes), []).extend(of_row)
     for name, of_row in elsewhere.items():
         for row, prefix, measured in [(name, "test/", of_row), *_sampled_again(name, of_row)]:
             cells += [
                 cell("5", row, column, None, metric.replace("test/", prefix), measured)
                 for metric, column in ELSEWHERE.items()
             ]
-        demonstrations = f"{BASELINE}feasible, {' '.join(of_row[0].changes)}"
-        for metric, column in ELSEWHERE.items():
-            if metric.startswith("test/none/"):
-                baseline = metric.replace("test/none/", "without_model/feasible/")
-                cells.append(cell("5", demonstrations, column, None, baseline, of_row[:1]))
+        changes = " ".join(of_row[0].changes)
+        cells += _row_without_model("5", f"feasible, {changes}", "feasible", ELSEWHERE, every.pop(changes, []))
     return cells
 
 
@@ -269,15 +269,22 @@ def _without_model(table: str, columns: Mapping[str, str], runs: Mapping[str, li
     every = [run for by_seed in runs.values() for run in by_seed]
     rows = [(f"source {name}", "source", runs[name]) for name in SOURCES if name in runs]
     rows += [("test data", "data", every), ("feasible test data", "feasible", every)]
-    rows = [(named(row, of_row), group, of_row) for row, group, of_row in rows]
     cells = []
     for row, group, of_row in rows:
-        for metric, column in columns.items():
-            if metric.startswith("test/none/"):
-                baseline = metric.replace("test/none/", f"without_model/{group}/")
-                # The same demonstrations for every run, so they are counted once.
-                chosen = of_row if group == "source" else [run for run in every if _measured(baseline, [run])][:1]
-                cells.append(cell(table, f"{BASELINE}{row}", column, None, baseline, chosen))
+        cells += _row_without_model(table, named(row, of_row), group, columns, of_row)
+    return cells
+
+
+def _row_without_model(
+    table: str, row: str, group: str, columns: Mapping[str, str], runs: Sequence[Record]
+) -> list[Cell | None]:
+    """A source's row, over all runs, or one of demonstrations, the same for every run and so counted once."""
+    cells = []
+    for metric, column in columns.items():
+        if metric.startswith("test/none/"):
+            baseline = metric.replace("test/none/", f"without_model/{group}/")
+            chosen = runs if group == "source" else [run for run in runs if _measured(baseline, [run])][:1]
+            cells.append(cell(table, f"{BASELINE}{row}", column, None, baseline, chosen))
     return cells
 
 
