@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from conflow.grid import local
 from conflow.grid.local import Job, _train_all
 from conflow.tracking import signals
 from conflow.training import config, progress
@@ -33,6 +34,17 @@ def test_a_grid_with_a_mistyped_cell_is_refused_before_any_is_started(argument: 
     assert refused.returncode == 2
     assert len(output.splitlines()) == 1
     assert not (tmp_path / "runs" / "mlflow.db").exists()
+
+
+@pytest.mark.parametrize(
+    ("seeds", "arguments", "names"),
+    [(["0", "0"], [], ["cgp-s0", "fm-s0"]), (["0", "1"], ["seed=5"], ["cgp-s5", "fm-s5"])],
+)
+def test_an_experiment_that_is_asked_for_twice_is_one_cell(
+    seeds: list[str], arguments: list[str], names: list[str]
+) -> None:
+    found = local.cells(["cgp", "fm"], seeds, ["preset=smoke", *arguments])
+    assert [cell.name for cell in found] == names
 
 
 def test_a_cluster_without_ray_is_refused_with_how_to_install_it(tmp_path: Path) -> None:

@@ -93,16 +93,18 @@ def run(
 
 
 def cells(ablations: Sequence[str], seeds: Sequence[str], arguments: Sequence[str]) -> list[Job]:
-    """Every ablation for every seed.
+    """Every ablation for every seed, the same experiment once.
 
     Raises:
         ConfigError: any of them cannot be asked for.
     """
-    return [
-        Job(chosen, config.load(chosen))
-        for seed in seeds
-        for chosen in ([f"ablation={ablation}", f"seed={seed}", *arguments] for ablation in ablations)
-    ]
+    found: dict[str, Job] = {}
+    for seed in seeds:
+        for ablation in ablations:
+            chosen = [f"ablation={ablation}", f"seed={seed}", *arguments]
+            cell = Job(chosen, config.load(chosen))
+            found.setdefault(cell.config.sha(), cell)
+    return list(found.values())
 
 
 def failures(cells: Sequence[Job], console: Console) -> int:
