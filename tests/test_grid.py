@@ -1,4 +1,5 @@
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -11,9 +12,11 @@ from rich.console import Console
 
 from conflow.grid import local
 from conflow.grid.local import Job, _train_all
-from conflow.tracking import signals
+from conflow.tracking import recording, signals
 from conflow.training import config, progress
+from conflow.training.datamodule import DemonstrationData
 from conflow.training.progress import ProgressDisplay
+from conflow.training.train import experiment
 from tests.conftest import raising_signals
 
 GRID = ["ablations", "preset=smoke", "seeds=0", "ablations=cgp fm"]
@@ -45,6 +48,34 @@ def test_an_experiment_that_is_asked_for_twice_is_one_cell(
 ) -> None:
     found = local.cells(["cgp", "fm"], seeds, ["preset=smoke", *arguments])
     assert [cell.name for cell in found] == names
+
+
+def test_what_another_process_trains_or_has_finished_meanwhile_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three cells one is at work elsewhere as the grid begins, and one is finished elsewhere during the first."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    cgp, _, plus = (cell.config for cell in local.cells(["cgp", "fm", "plus"], ["0"], ["preset=smoke"]))
+    popen, started = subprocess.Popen, list[str]()
+
+    def begin(command: list[str], **options: Any) -> "subprocess.Popen[str]":
+        if "train" not in command:
+            return popen(command, **options)
+        started.extend(argument for argument in command if argument.startswith("ablation="))
+        with recording.start(experiment(plus, DemonstrationData(plus))):
+            pass
+        return popen([sys.executable, "-c", ""], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    console = Console(width=200)
+    with console.capture() as captured, recording.start(experiment(cgp, DemonstrationData(cgp))):
+        assert local.run(["cgp", "fm", "plus"], ["0"], ["preset=smoke"], 1, console) == 0
+    assert started == ["ablation=fm"]
+    first, *rest = [line.rstrip() for line in captured.get().splitlines()]
+    assert first == "3 cells, 0 of them finished before"
+    assert rest[0] == f"cgp-s0: another process trains it, on {platform.node()}"
+    assert not any("3/3" in line or "done" in line for line in rest)
 
 
 def test_a_cluster_without_ray_is_refused_with_how_to_install_it(tmp_path: Path) -> None:

@@ -394,7 +394,7 @@ def test_a_grid_knows_its_cells_by_their_code_too(
 
     def seen(any_code: bool) -> tuple[bool, list[str], str]:
         cell = Job([], data.config)
-        return finished(cell, any_code), cell.arguments, cell.again
+        return finished(cell, any_code), cell.resume, cell.again
 
     again = [f"resume={run.info.run_id}"]
     assert seen(any_code=False) == (not resumes, again if resumes else [], "")

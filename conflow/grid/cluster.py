@@ -27,10 +27,8 @@ import conflow
 from conflow.errors import ConfigError
 from conflow.grid import local
 from conflow.grid.local import Job
-from conflow.scene.errors import DemonstrationError
 from conflow.tracking import carried, code, liveness, recording, signals, store
 from conflow.training import config, progress
-from conflow.training.datamodule import DemonstrationData
 from conflow.training.progress import ProgressDisplay
 
 OUTPUT = Path("runs", "output")
@@ -350,7 +348,7 @@ def _attempt(number: int, arguments: list[str], sha: str, any_code: bool, place:
     cell = Job(list(arguments), config.load(arguments))
     if cell.config.sha() != sha:
         return Ended(host, f"{host}: found other settings in conf/, expected the same as where the grid was started")
-    while other := _elsewhere(cell, any_code):
+    while other := local.elsewhere(cell, any_code):
         board.say.remote(number, (f"waits for {other}", 0, 1))
         time.sleep(5)
     if local.finished(cell, any_code):
@@ -360,7 +358,7 @@ def _attempt(number: int, arguments: list[str], sha: str, any_code: bool, place:
     with tempfile.TemporaryDirectory() as folder, output_of(cell).open("a") as output:
         said = Path(folder, "progress")
         child = subprocess.Popen(
-            [sys.executable, "-m", "conflow", "train", *cell.arguments],
+            [sys.executable, "-m", "conflow", "train", *cell.arguments, *cell.resume],
             stdout=output,
             stderr=subprocess.STDOUT,
             env=_environment(place) | {progress.FILE: str(said)},
@@ -382,18 +380,6 @@ def _attempt(number: int, arguments: list[str], sha: str, any_code: bool, place:
         text = file.read()
     lines = [line.strip() for line in text.splitlines() if line.strip()] or ["no output"]
     return Ended(host, f"on {host}: {lines[-1]}" if child.returncode else "", "" if place.shared else text)
-
-
-def _elsewhere(cell: Job, any_code: bool) -> str:
-    """The machine where another process trains a cell now, or did until it fell silent less than ten minutes ago."""
-    try:
-        digest = DemonstrationData(cell.config, training=False).digest
-    except DemonstrationError:
-        return ""
-    for run in store.runs("RUNNING", config_sha=cell.config.sha(), data_digest=digest):
-        if "alive_until" in run.data.tags and (any_code or not code.differing(run.data.tags)):
-            return str(run.data.tags["host"])
-    return ""
 
 
 def _environment(place: Place) -> dict[str, str]:
