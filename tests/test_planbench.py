@@ -20,7 +20,7 @@ from conflow.figures.planbench import animation, success
 from conflow.planner import PlanError, Planner
 from conflow.results import peers
 from conflow.results import planbench as results
-from conflow.results.planbench import Record, Settings
+from conflow.results.planbench import Record, Row, Settings
 from conflow.results.printing import Format
 from conflow.scene.settings import Box
 from conflow.scene.tasks import CROWDS
@@ -195,6 +195,21 @@ def test_what_is_published_stands_apart_with_its_hardware(record: Record) -> Non
     assert overview[4 + len(record.rows)].startswith(
         "| published, on one large GPU |  | Akule 512/512, 29.9 s<br>MMD 512"
     )
+
+
+def test_several_seeds_are_one_row_of_the_overview_and_other_settings_are_rows_of_their_own() -> None:
+    """Of two seeds one solved both scenes in 1 and 2 s, the other one of two in 3 and 4 s."""
+    some, other = Row("plus-s0, 5 steps", [True, True], [1.0, 2.0]), Row("plus-s1, 5 steps", [True, False], [3.0, 4.0])
+    guided = Row("long/plus-s0, 5 steps, guided", [False], [5.0])
+    weave, room = (
+        Record(task, 8, 1, {"num": 4, "limit": 5}, "here", rows)
+        for task, rows in (("weave", [some, other]), ("room", [some, guided]))
+    )
+    rows = printed([weave, room], "markdown").split("\n\n")[1].splitlines()[2:-1]
+    assert rows == [
+        "| plus, 5 steps | 3/4 [0.301, 0.954]<br>2.500 s | 2/2 [0.342, 1.000]<br>1.500 s |",
+        "| long/plus, 5 steps, guided |  | 0/1 [0.000, 0.793]<br>5.000 s |",
+    ]
 
 
 def test_a_model_meets_maps_and_radii_that_it_was_not_trained_on(model: ConFlow) -> None:

@@ -169,7 +169,7 @@ def _attempts(records: Sequence[Record]) -> list[Attempt]:
 
 def _overview(records: Sequence[Record]) -> Sheet:
     """Every record in a column: who solved how many scenes, and how soon on average."""
-    by_kind = [{_kind(row.method): row for row in record.rows} for record in records]
+    by_kind = [_pooled(record.rows) for record in records]
     kinds = dict.fromkeys(kind for own in by_kind for kind in own)
     rows = []
     for kind in sorted(kinds, key=lambda kind: kind.startswith("ORCA")):
@@ -187,9 +187,15 @@ def _overview(records: Sequence[Record]) -> Sheet:
     return title, header, [*rows, ["published, on one large GPU", *others]]
 
 
-def _kind(method: str) -> str:
-    """A method without seed and settings."""
-    return re.sub(r"-s\d+, .*", "", method)
+def _pooled(rows: Sequence[Row]) -> dict[str, Row]:
+    """Rows by method without seed: the attempts of networks that differ in nothing else are one row's."""
+    pooled: dict[str, Row] = {}
+    for row in rows:
+        kind = re.sub(r"-s\d+(?=, )", "", row.method)
+        into = pooled.setdefault(kind, Row(kind))
+        into.passed += row.passed
+        into.seconds += row.seconds
+    return pooled
 
 
 def _solved(row: Row) -> str:
