@@ -278,6 +278,33 @@ def _from_line(x: Tensor) -> Tensor:
     return cross.abs() / travel.square().sum(dim=2)
 
 
+def _models(options: Mapping[str, str], arguments: Sequence[str], task: SceneTask, guided: bool) -> dict[str, ConFlow]:
+    """The models of the runs that the option `run` names, by what tables call them.
+
+    Raises:
+        ConfigError: one of a task that is too different, or one that was named before.
+    """
+    found = []
+    for name in options["run"].split(","):
+        model = load_model(store.artifact(store.find_run(name), MODEL_FILE), arguments)
+        taken = model.config
+        if taken.task != options["task"] and not (isinstance(task, CrowdTask) and taken.task in CROWDS):
+            crowds = " or another one of many robots" if isinstance(task, CrowdTask) else ""
+            raise ConfigError(f"run={name}: is of task {taken.task}, expected {options['task']}{crowds}")
+        learned = "" if taken.task == options["task"] else f"{taken.task}-"
+        solver = "" if taken.sample.solver == "euler" else f"{taken.sample.solver} "
+        steps = f"{taken.sample.steps} {solver}steps{', guided' * guided}"
+        found.append((name, f"{learned}{taken.ablation}-s{taken.seed}, {steps}", model))
+    labels = [label for _, label, _ in found]
+    models: dict[str, ConFlow] = {}
+    for name, label, model in found:
+        own = label if labels.count(label) == 1 else f"{model.config.preset}/{label}"
+        if own in models:
+            raise ConfigError(f"run={name}: found {own} twice, expected once")
+        models[own] = model
+    return models
+
+
 def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Console) -> None:
     """Run the benchmark as the command line asks, print, write and draw what came of it; or print what is of record.
 
@@ -287,7 +314,7 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
         console: for progress and the table.
 
     Raises:
-        ConfigError: an option that cannot be used, or a run of a task that is too different.
+        ConfigError: an option that cannot be used, or runs that cannot be compared.
     """
     form = checked_format(options["format"])
     if commandline.whole(options, "reference", 0, 1):
@@ -300,17 +327,7 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
     guided = commandline.whole(options, "guided", 0, 1) == 1
     settings = Settings(num, commandline.number(options, "limit"), guided)
     task = with_scenes(named, robots)
-    models = {}
-    for name in [] if options["run"] == "none" else options["run"].split(","):
-        model = load_model(store.artifact(store.find_run(name), MODEL_FILE), arguments)
-        taken = model.config
-        if taken.task != options["task"] and not (isinstance(task, CrowdTask) and taken.task in CROWDS):
-            crowds = " or another one of many robots" if isinstance(task, CrowdTask) else ""
-            raise ConfigError(f"run={name}: is of task {taken.task}, expected {options['task']}{crowds}")
-        learned = "" if taken.task == options["task"] else f"{taken.task}-"
-        solver = "" if taken.sample.solver == "euler" else f"{taken.sample.solver} "
-        steps = f"{taken.sample.steps} {solver}steps{', guided' * guided}"
-        models[f"{learned}{taken.ablation}-s{taken.seed}, {steps}"] = model
+    models = {} if options["run"] == "none" else _models(options, arguments, task, guided)
     with ProgressDisplay(console) as display:
         record = run(named, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)

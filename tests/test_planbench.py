@@ -263,16 +263,41 @@ def test_the_benchmark_is_of_crowds_that_find_room(model: ConFlow) -> None:
             planbench.run(crowded, {}, 300, 1, 0, settings, display)
 
 
+def asked(**chosen: str) -> dict[str, str]:
+    """All options of the command."""
+    options = {"task": "weave", "n": "8", "scenes": "1", "run": "none", "seed": "0", "num": "2", "limit": "1"}
+    return options | {"guided": "0", "format": "csv", "reference": "0", "out": "none"} | chosen
+
+
 @pytest.mark.parametrize(
     ("option", "said"), [("n=1", "n=1: expected"), ("scenes=0", "scenes=0: expected"), ("limit=x", "limit=x: expected")]
 )
 def test_an_option_that_cannot_be_used_is_named(option: str, said: str) -> None:
     key, value = option.split("=")
-    options = {"task": "weave", "n": "8", "scenes": "2", "run": "x", "seed": "0", "num": "2", "limit": "1"}
-    options |= {"guided": "0", "format": "table", "reference": "0", "out": "none", key: value}
+    options = asked(run="x") | {key: value}
     with pytest.raises(ConfigError) as refused:
         planbench.planbench(options, [], Console(quiet=True))
     assert str(refused.value).startswith(said)
+
+
+def test_models_of_one_name_are_told_apart_by_their_preset_and_the_same_twice_is_refused(
+    model: ConFlow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two presets, one of which makes smaller networks."""
+    other = config.load(["task=weave", "ablation=plus", "preset=quick", f"sample.steps={SETTINGS.sample.steps}"])
+    runs = {"smoke/weave-plus-s0": model, "quick/weave-plus-s0": ConFlow(other, build_task(other)).eval()}
+    monkeypatch.setattr(planbench.store, "find_run", lambda name: name)
+    monkeypatch.setattr(planbench.store, "artifact", lambda run, _: run)
+    monkeypatch.setattr(planbench, "load_model", lambda path, _: runs[path])
+    console = Console(width=300)
+    with console.capture() as captured:
+        planbench.planbench(asked(run=",".join(runs), out=str(tmp_path)), [], console)
+    steps = f"{SETTINGS.sample.steps} steps"
+    for name in (f"smoke/plus-s0, {steps}", f"quick/plus-s0, {steps}"):
+        assert captured.get().count(f'"{name}"') == 1
+    twice = ",".join([*runs, "quick/weave-plus-s0"])
+    with pytest.raises(ConfigError, match=r"^run=quick/weave-plus-s0: found quick/plus-s0, .* twice, expected once$"):
+        planbench.planbench(asked(run=twice), [], Console(quiet=True))
 
 
 def test_one_plan_is_drawn_in_motion(record: Record, tmp_path: Path) -> None:
