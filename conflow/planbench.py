@@ -327,6 +327,8 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
     guided = commandline.whole(options, "guided", 0, 1) == 1
     settings = Settings(num, commandline.number(options, "limit"), guided)
     task = with_scenes(named, robots)
+    if options["run"] == "none":
+        commandline.options(arguments, options, settings=False)  # settings are a model's
     models = {} if options["run"] == "none" else _models(options, arguments, task, guided)
     with ProgressDisplay(console) as display:
         record = run(named, models, robots, scenes, seed, settings, display)

@@ -280,6 +280,11 @@ def test_an_option_that_cannot_be_used_is_named(option: str, said: str) -> None:
     assert str(refused.value).startswith(said)
 
 
+def test_without_a_model_an_option_that_is_none_is_named_with_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"^limt: no such option, expected task, .*; did you mean limit\?$"):
+        planbench.planbench(asked(), ["limt=20"], Console(quiet=True))
+
+
 def test_models_of_one_name_are_told_apart_by_their_preset_and_the_same_twice_is_refused(
     model: ConFlow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
