@@ -25,6 +25,7 @@ from conflow.results.printing import Format
 from conflow.scene.settings import Box
 from conflow.scene.tasks import CROWDS
 from conflow.scene.tasks.crowd import CrowdTask
+from conflow.tracking import store
 from conflow.training import config
 from conflow.training.build import build_task
 from conflow.training.datamodule import DemonstrationData
@@ -291,8 +292,8 @@ def test_models_of_one_name_are_told_apart_by_their_preset_and_the_same_twice_is
     """Of two presets, one of which makes smaller networks."""
     other = config.load(["task=weave", "ablation=plus", "preset=quick", f"sample.steps={SETTINGS.sample.steps}"])
     runs = {"smoke/weave-plus-s0": model, "quick/weave-plus-s0": ConFlow(other, build_task(other)).eval()}
-    monkeypatch.setattr(planbench.store, "find_run", lambda name: name)
-    monkeypatch.setattr(planbench.store, "artifact", lambda run, _: run)
+    monkeypatch.setattr(store, "find_run", lambda name: name)
+    monkeypatch.setattr(store, "artifact", lambda run, _: run)
     monkeypatch.setattr(planbench, "load_model", lambda path, _: runs[path])
     console = Console(width=300)
     with console.capture() as captured:
