@@ -27,7 +27,7 @@ def statuses(folder: Path) -> list[tuple[str, str]]:
 
 
 def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    longer = (*GRID, "train.max_steps=2000", "train.val_every=1000")
+    longer = (*GRID, "train.max_steps=5000", "train.val_every=2500")
     stopped = processes.start(tmp_path, *longer)
     deadline = time.monotonic() + 180
     # Then its first cell makes the store.

@@ -109,7 +109,7 @@ def test_a_models_settings_do_not_read_the_environment(
     with pytest.raises(ConfigError, match=r"^ablation=\$\{oc.env:SECRET\}: expected"):
         config.from_tree(checkpoint["conflow"]["config"])
     outcome = command("sample", f"run=./{MODEL_FILE}", *PAIR)
-    assert_refused(outcome, f"expected the {MODEL_FILE} of a run")
+    assert_refused(outcome, f"run=./{MODEL_FILE}: ablation=${{oc.env:SECRET}}: expected a name")
     assert "swordfish" not in outcome.err + outcome.out
 
 
