@@ -51,7 +51,9 @@ def weave() -> CrowdTask:
 def test_a_planner_takes_any_number_of_robots(model: ConFlow, count: int) -> None:
     """With the same weights, also more than training saw."""
     start, goal = CROWDS["weave"](count).scene(count, 0, 0)
+    state = torch.get_rng_state()
     plans = Planner(model).plan(start, goal, num=6, descent=40)
+    assert torch.equal(torch.get_rng_state(), state)
     assert plans.x.shape == (6, 64, 2 * count)
     assert torch.equal(plans.x[:, [0, -1]], torch.stack([start, goal]).expand(6, -1, -1))
     assert bool(plans.feasible[0])

@@ -15,6 +15,7 @@ from scipy import stats
 from conflow.errors import ConfigError
 from conflow.results import comparison, paper, printing, records
 from conflow.results.records import Record
+from conflow.results.statistics import holm
 from conflow.results.tables import Cell, tables
 from conflow.tracking import code, store
 from conflow.training.config import flatten, load
@@ -272,6 +273,37 @@ def test_a_run_in_bf16_counts_for_a_seed_that_has_none_in_single_precision() -> 
     # Seed 0 in both stands beside each other.
     beside = cell(found, "4", "ConFlow (D+ and D-), train.precision=bf16", "none: robot")
     assert (beside.count, beside.seeds, beside.machine) == (100, 1, "bf16 on a machine")
+
+
+def test_a_reading_in_bf16_counts_for_a_seed_that_has_none_in_single_precision() -> None:
+    """As one of no changes does, under the reading's own name."""
+    published("cgp", 0, 300, "correction.mask=feasible")
+    published("cgp", 0, 100, "correction.mask=feasible", "train.precision=bf16")
+    published("cgp", 1, 200, "correction.mask=feasible", "train.precision=bf16")
+    published("cgp", 0, 50, "data.seed=7", "train.precision=bf16")
+    (found,) = comparison.collect_reference()
+    row = "ConFlow (D+ and D-), correction.mask=feasible"
+    assert [cell(found, "4", row, "none: robot").count, cell(found, "4", row, "none: robot").seeds] == [500, 2]
+    assert cell(found, "4", f"{row} train.precision=bf16", "none: robot").count == 100
+    assert cell(found, "5", "ConFlow (D+ and D-), data.seed=7", "none: robot").machine == "bf16 on a machine"
+
+
+def test_that_negatives_help_is_claimed_for_each_reading_that_has_both() -> None:
+    """All claims together are corrected once; what is no reading of the paper is not judged."""
+    for seed in range(3):
+        for ablation, count in (("cgp", 10), ("no_negatives", 400)):
+            published(ablation, seed, count + seed)
+            published(ablation, seed, 410 - count + seed, "constraint.reduction=closest", "train.precision=bf16")
+            published(ablation, seed, count + seed, "train.lr=0.1")
+        published("cgp", seed, count + seed, "correction.mask=feasible")
+    (found,) = comparison.collect_reference()
+    claims = {claim.text: claim for claim in found.claims if claim.text.startswith("negatives help")}
+    assert len(claims) == 8
+    assert claims["negatives help ConFlow (none: robot)"].verdict == "holds"
+    reading = claims["negatives help ConFlow (none: robot), constraint.reduction=closest"]
+    assert (reading.verdict, reading.detail) == ("reversed", "0.4010 against 0.0110, 3 and 3 seeds, 3 in pairs")
+    tested = [claim for claim in found.claims if claim.p is not None and claim.corrected_p is not None]
+    assert [claim.corrected_p for claim in tested] == holm([claim.p for claim in tested if claim.p is not None])
 
 
 def test_readings_of_another_task_show_its_own_collisions() -> None:

@@ -144,7 +144,7 @@ def test_evaluating_again_adds_to_the_run_and_changes_nothing_that_it_had(
     options: list[str], split: config.SplitName, mark: str, conflow: Command, workplace: Path, trained: tuple[Run, str]
 ) -> None:
     before, _ = trained
-    settings = ["sample.steps=3", "sample.solver=midpoint", "seed=8"]
+    settings = ["sample.steps=5", "sample.steps=3", "sample.solver=midpoint", "seed=8"]  # of two the last counts
     result = conflow("evaluate", f"run={before.info.run_id}", *settings, *options)
     assert result.returncode == 0, result.stderr
     assert f"seed:8, {config.SPLITS[split]} split" in " ".join(result.stdout.split())

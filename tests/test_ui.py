@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from conflow.tracking import ui
 from tests.conftest import Command
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -51,6 +52,16 @@ def test_the_pages_are_served_on_this_machine_alone(address: str) -> None:
     with urllib.request.urlopen(address.split("#")[0]) as answer:
         assert answer.status == 200
         assert b"MLflow" in answer.read()
+
+
+def test_a_password_of_the_server_is_not_printed(
+    address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    server = address.split("/#")[0]
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", server.replace("//", "//ada:swordfish@"))
+    ui.serve(5000)
+    assert capsys.readouterr().out.strip() == address
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")

@@ -1,10 +1,10 @@
 """The paper's claims, and ours, in words: what the runs say to each."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from conflow.results import statistics
+from conflow.results import paper, statistics
 from conflow.results.records import Record
 from conflow.results.statistics import LEVEL, Difference
 from conflow.results.tables import COLLISIONS, QUALITIES, cell, collisions, scores
@@ -33,18 +33,21 @@ class Claim:
     detail: str
 
 
-def claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
-    """Each as "a is lower than b"; none where there are no runs at all."""
+def claims(runs: Mapping[str, list[Record]], readings: Iterable[list[Record]] = ()) -> list[Claim]:
+    """Each as "a is lower than b"; none where there are no runs at all.
+
+    Args:
+        runs: by ablation, a run for each seed.
+        readings: the rows of changed settings. Where ConFlow was trained with and without negatives under another
+            reading of the paper, the claim that they help is made for that one as well.
+    """
     if not runs or collisions(runs) is not COLLISIONS:  # a task of its own has claims of its own
         return []
     none, robot, *_ = COLLISIONS
     nearer = ("test/robot/energy_distance", "test/none/energy_distance")
     rates = [
         ("ConFlow collides less than FM, without guidance", "cgp", "fm", none),
-        *(
-            (f"negatives help ConFlow ({column})", "cgp", "no_negatives", metric)
-            for metric, column in list(COLLISIONS.items())[:4]
-        ),
+        *_negatives_help(),
         ("naive negatives hurt FM, without guidance", "fm", "fm_mixed", none),
         ("CGP beats Gaussian: collision rate", "cgp", "gaussian", none),
     ]
@@ -57,7 +60,27 @@ def claims(runs: Mapping[str, list[Record]]) -> list[Claim]:
         ("guided by descent, D+ alone is nearer to held-out D+ than plus without guidance", "descent", "plus", *nearer),
     ]
     ordered = [*rates, *((f"CGP beats Gaussian: {row}", "cgp", "gaussian", key) for key, row in others), *ours]
-    return _judged([_compared(runs, *claim) for claim in ordered])
+    compared = [_compared(runs, *claim) for claim in ordered]
+    for reading, of_reading in _other_readings(readings).items():
+        compared += [_compared(of_reading, *claim) for claim in _negatives_help(f", {reading}")]
+    return _judged(compared)
+
+
+def _negatives_help(reading: str = "") -> list[tuple[str, str, str, str]]:
+    """The claim in each of the paper's columns."""
+    columns = list(COLLISIONS.items())[:4]
+    text = "negatives help ConFlow"
+    return [(f"{text} ({column}){reading}", "cgp", "no_negatives", metric) for metric, column in columns]
+
+
+def _other_readings(rows: Iterable[list[Record]]) -> dict[str, dict[str, list[Record]]]:
+    """The runs of both ablations that the claim is of, by reading; those of a seed's second precision left out."""
+    found: dict[str, dict[str, list[Record]]] = {}
+    for of_row in rows:
+        changed = [change.partition("=")[0] for change in of_row[0].reading]
+        if changed and all(name in paper.OPEN for name in changed):
+            found.setdefault(" ".join(of_row[0].reading), {}).setdefault(of_row[0].ablation, of_row)
+    return {reading: of_reading for reading, of_reading in found.items() if {"cgp", "no_negatives"} <= {*of_reading}}
 
 
 def _compared(

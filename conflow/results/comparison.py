@@ -89,25 +89,27 @@ def collect_reference() -> list[Comparison]:
 
 def _of_records(published: Sequence[Record]) -> Comparison:
     """Compare records of one task at one preset."""
-    plain, changed = _apart(published)
-    runs, readings = _grouped(plain, lambda one: one.ablation), _grouped(changed, _reading)
+    counted, beside = _apart(published)
+    runs = _grouped([one for one in counted if one.of_preset], lambda one: one.ablation)
+    changed = [one for one in counted if not one.of_preset]
+    readings = _grouped(changed, lambda one: method(one.ablation, [one]))
+    readings |= _grouped(beside, lambda one: f"{method(one.ablation, [])}, {' '.join(one.changes)}")
     found = _comparison(published[0].preset, runs, readings, _of_different_code(runs | readings), "test", [])
     return found if found.task == PAPERS_TASK else _with_task(found)
 
 
 def _apart(published: Iterable[Record]) -> tuple[list[Record], list[Record]]:
-    """Records of a preset as it stands, one for each ablation and seed, and those of changed settings.
+    """Records that count, one for each ablation, seed and reading, and those that stand beside them.
 
     In which precision a network was trained is a matter of the machine and no reading of the paper. So a run in bf16
     counts for its seed, unless there is one in single precision; then it stands beside it as a changed one.
     """
-    plain: dict[tuple[str, int], Record] = {}
-    changed = []
-    for one in sorted(published, key=lambda one: bool(one.changes)):
-        counts = one.of_preset and plain.setdefault((one.ablation, one.seed), one) is one
-        if not counts:
-            changed.append(one)
-    return list(plain.values()), changed
+    counted: dict[tuple[str, ...], Record] = {}
+    beside = []
+    for one in sorted(published, key=lambda one: len(one.changes)):
+        if counted.setdefault((one.ablation, str(one.seed), *one.reading), one) is not one:
+            beside.append(one)
+    return list(counted.values()), beside
 
 
 def _with_task(found: Comparison) -> Comparison:
@@ -138,11 +140,6 @@ def _grouped(records: Iterable[Record], name: Callable[[Record], str]) -> dict[s
     for one in sorted(records, key=lambda one: (rank.get(one.ablation, len(rank)), name(one), one.seed)):
         groups.setdefault(name(one), []).append(one)
     return groups
-
-
-def _reading(one: Record) -> str:
-    """The name of a row for a changed run: all that sets it apart from the row without changes."""
-    return f"{METHODS.get(one.ablation, one.ablation)}, {' '.join(one.changes)}"
 
 
 def _of_other_code(records: Iterable[Record]) -> str:
@@ -183,7 +180,7 @@ def _comparison(
     return Comparison(
         preset,
         cells,
-        claims(runs),
+        claims(runs, readings.values()),
         {name: [one.run_id for one in of_row] for name, of_row in rows.items()},
         _commands(runs, readings, split),
         " ".join(f"{key}={first.settings[key]}" for key in paper.OPEN if key in first.settings),

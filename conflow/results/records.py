@@ -144,9 +144,14 @@ class Record:
         return f"{precision} on {self.origin.get('hardware', 'an unknown machine')}"
 
     @property
+    def reading(self) -> list[str]:
+        """The changes that are no matter of the machine: all but the precision."""
+        return [change for change in self.changes if not change.startswith(f"{PRECISION}=")]
+
+    @property
     def of_preset(self) -> bool:
         """Whether this is its task, ablation and preset as they stand, in whichever precision."""
-        return all(change.startswith(f"{PRECISION}=") for change in self.changes)
+        return not self.reading
 
     @property
     def chosen(self) -> str:

@@ -158,7 +158,7 @@ def tables(runs: Mapping[str, list[Record]], readings: Mapping[str, list[Record]
 
 def named(name: str, runs: Sequence[Record]) -> str:
     """A row's name, of changed runs with what is changed about them."""
-    return name if not runs or runs[0].of_preset else f"{name}, {' '.join(runs[0].changes)}"
+    return name if not runs or runs[0].of_preset else f"{name}, {' '.join(runs[0].reading)}"
 
 
 def method(ablation: str, runs: Sequence[Record]) -> str:
@@ -244,7 +244,7 @@ def _of_readings(runs: Mapping[str, list[Record]]) -> Mapping[str, str]:
 
 def _on_other_data(run: Record) -> bool:
     """Whether all that is changed about a run is what was demonstrated, and not what it made of that."""
-    return all(change.partition("=")[0] in DEMONSTRATED for change in run.changes)
+    return bool(run.reading) and all(change.partition("=")[0] in DEMONSTRATED for change in run.reading)
 
 
 def _table_5(elsewhere: Mapping[str, list[Record]]) -> list[Cell | None]:
@@ -252,14 +252,14 @@ def _table_5(elsewhere: Mapping[str, list[Record]]) -> list[Cell | None]:
     cells: list[Cell | None] = []
     every: dict[str, list[Record]] = {}
     for of_row in elsewhere.values():
-        every.setdefault(" ".join(of_row[0].changes), []).extend(of_row)
+        every.setdefault(" ".join(of_row[0].reading), []).extend(of_row)
     for name, of_row in elsewhere.items():
         for row, prefix, measured in [(name, "test/", of_row), *_sampled_again(name, of_row)]:
             cells += [
                 cell("5", row, column, None, metric.replace("test/", prefix), measured)
                 for metric, column in ELSEWHERE.items()
             ]
-        changes = " ".join(of_row[0].changes)
+        changes = " ".join(of_row[0].reading)
         cells += _row_without_model("5", f"feasible, {changes}", "feasible", ELSEWHERE, every.pop(changes, []))
     return cells
 

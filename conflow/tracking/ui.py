@@ -24,7 +24,7 @@ def serve(port: int) -> None:
     experiment = client.get_experiment_by_name(store.EXPERIMENT)
     assert experiment is not None
     # MLflow opens in another mode and on a list; this address is the classic view, on its charts.
-    server = uri.rstrip("/") if served else f"http://{HOST}:{port}"
+    server = store.place().rstrip("/") if served else f"http://{HOST}:{port}"
     page = f"{server}/#/experiments/{experiment.experiment_id}/runs"
     print(f"{page}?workflowType=machine_learning&compareRunsMode=CHART", flush=True)
     if served:

@@ -88,7 +88,8 @@ class ConFlow(nn.Module):
         if isinstance(self.v, ResMLP) and task.robots.D != self.D:
             expected = f"expected {self.task.robots.count}, for which alone this network has layers"
             raise ConfigError(f"task.robots={task.robots.count}: {expected}; ABLATION=plus has one for any number")
-        made = ConFlow(self.config, task)
+        with torch.random.fork_rng(devices=[]):  # a new network draws weights, which are not kept
+            made = ConFlow(self.config, task)
         made.v.load_state_dict(self.v.state_dict(), assign=True)
         return made.eval()
 

@@ -42,8 +42,9 @@ def evaluate_again(
     if differing := code.differing(run.data.tags):
         said = f"{run.info.run_name} was trained by other code, and is sampled by the present: {', '.join(differing)}"
         console.print(said, highlight=False, soft_wrap=True)
-    # MLflow allows no = in a metric's name.
-    label = " ".join(argument.replace("=", ":") for argument in sorted(arguments)) or UNCHANGED
+    # Of a setting that is given twice the last counts. MLflow allows no = in a metric's name.
+    applied = {argument.partition("=")[0]: argument for argument in arguments}
+    label = " ".join(argument.replace("=", ":") for argument in sorted(applied.values())) or UNCHANGED
     group = ("evaluate/" if split == "test" else EVALUATED_ON_VALIDATION) + label
     data = demonstrations(run, model)
     with ProgressDisplay(console) as display:
