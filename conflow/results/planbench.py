@@ -169,12 +169,12 @@ def _attempts(records: Sequence[Record]) -> list[Attempt]:
 
 def _overview(records: Sequence[Record]) -> Sheet:
     """Every record in a column: who solved how many scenes, and how soon on average."""
-    by_kind = [_pooled(record.rows) for record in records]
+    by_kind = [_by_kind(record.rows) for record in records]
     kinds = dict.fromkeys(kind for own in by_kind for kind in own)
     rows = []
     for kind in sorted(kinds, key=lambda kind: kind.startswith("ORCA")):
         own = [of_record.get(kind) for of_record in by_kind]
-        rows.append([kind, *(f"{_solved(row)}\n{mean(row.seconds):.3f} s" if row else "" for row in own)])
+        rows.append([kind, *(_of_networks(of_kind) if of_kind else "" for of_kind in own)])
     others = [
         "\n".join(
             f"{other.system.partition(' (')[0]} {other.solved}/{other.scenes}, {other.seconds:g} s"
@@ -187,20 +187,27 @@ def _overview(records: Sequence[Record]) -> Sheet:
     return title, header, [*rows, ["published, on one large GPU", *others]]
 
 
-def _pooled(rows: Sequence[Row]) -> dict[str, Row]:
-    """Rows by method without seed: the attempts of networks that differ in nothing else are one row's."""
-    pooled: dict[str, Row] = {}
+def _by_kind(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows by method without seed: those of networks that differ in nothing else."""
+    kinds: dict[str, list[Row]] = {}
     for row in rows:
-        kind = re.sub(r"-s\d+(?=, )", "", row.method)
-        into = pooled.setdefault(kind, Row(kind))
-        into.passed += row.passed
-        into.seconds += row.seconds
-    return pooled
+        kinds.setdefault(re.sub(r"-s\d+(?=, )", "", row.method), []).append(row)
+    return kinds
 
 
-def _solved(row: Row) -> str:
-    low, high = wilson(row.solved, row.scenes)
-    return f"{row.solved}/{row.scenes} [{low:.3f}, {high:.3f}]"
+def _of_networks(rows: Sequence[Row]) -> str:
+    """The attempts of networks of one kind together."""
+    return f"{_solved(rows)}\n{mean(one for row in rows for one in row.seconds):.3f} s"
+
+
+def _solved(rows: Sequence[Row]) -> str:
+    """How many attempts solved their scene, and the interval of their share.
+
+    All networks were asked the same scenes, so the interval is that of one network's number of scenes.
+    """
+    solved, attempts, scenes = sum(row.solved for row in rows), sum(row.scenes for row in rows), rows[0].scenes
+    low, high = wilson(round(solved * scenes / attempts), scenes)
+    return f"{solved}/{attempts} [{low:.3f}, {high:.3f}]"
 
 
 def _sheet(record: Record) -> Sheet:
@@ -229,7 +236,7 @@ def _cells(row: Row) -> list[str]:
         distance = f"{value} [{low}, {high}]"
     return [
         row.method,
-        _solved(row),
+        _solved([row]),
         *(f"{of(row.seconds):.3f}" for of in (mean, median, max)),
         share(row.raw_feasible, row.raw),
         share(row.guided_feasible, row.guided),
