@@ -1,8 +1,11 @@
+from typing import Any
+
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.fx.experimental import _config
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from conflow.flow.network import SpectralMLP
 from conflow.flow.path import guided_path, interpolate
@@ -205,11 +208,22 @@ def test_training_and_sampling_need_a_device_no_float64(ablation: list[str]) -> 
     assert {(result.device.type, result.dtype) for result in results} == {("meta", torch.float32)}
 
 
+class OneDevice(TorchDispatchMode):
+    """Refuses a tensor that is indexed by another device's, which an accelerator refuses and "meta" does not."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func._schema.name in ("aten::index", "aten::index_put_"):
+            for index in (one for one in args[1] if one is not None):
+                assert index.device.type in ("cpu", args[0].device.type), "indexed by another device's tensor"
+        return func(*args, **kwargs or {})
+
+
 @pytest.mark.parametrize("task", ["weave", "pandas", "planar_arms"])
 def test_many_robots_and_arms_train_on_a_device(task: str) -> None:
     flow = model_of(config.load([f"task={task}", "ablation=plus", "preset=smoke", "source.fit=false"])).to("meta")
     x_1, M = torch.zeros(8, flow.T, flow.D, device="meta"), torch.ones(8, dtype=torch.bool, device="meta")
-    with _config.patch(meta_nonzero_assume_all_nonzero=True):  # type: ignore[attr-defined]  # "meta" cannot know which
+    assume = _config.patch(meta_nonzero_assume_all_nonzero=True)  # type: ignore[attr-defined]  # "meta" cannot know
+    with assume, OneDevice():
         results = [flow.loss(x_1, M, None), flow.u_c(x_1)]  # type: ignore[arg-type]
     assert {(result.device.type, result.dtype) for result in results} == {("meta", torch.float32)}
     robots = flow.task.robots

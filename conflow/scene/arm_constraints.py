@@ -334,10 +334,11 @@ class Table(Bounded):
 
     def _gaps(self, x: Tensor) -> Tensor:
         """z - r of every sphere, (spheres, batch T)."""
-        link, owner = self.robots.link[self.lifted], self.robots.owner[self.lifted]
-        local = F.pad(self.robots.local[self.lifted], (0, 1), value=1.0).to(x)
-        z = torch.einsum("sk,skn->sn", local, self.robots.frames(x)[link, :, 2, owner])
-        return z - (self.height + self.robots.radii[self.lifted].to(x))[:, None]
+        robots = self.robots
+        link, owner = robots.link.to(x.device)[self.lifted], robots.owner.to(x.device)[self.lifted]
+        local = F.pad(robots.local.to(x)[self.lifted], (0, 1), value=1.0)
+        z = torch.einsum("sk,skn->sn", local, robots.frames(x)[link, :, 2, owner])
+        return z - (self.height + robots.radii.to(x)[self.lifted])[:, None]
 
 
 class JointSpeed(Constraint):
