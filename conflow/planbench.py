@@ -162,7 +162,7 @@ def run(
         models: by name.
         robots: how many.
         scenes: how many, the first of the seed's.
-        seed: of scenes and candidates.
+        seed: of scenes.
         settings: how scenes are solved.
         display: for progress.
 

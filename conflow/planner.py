@@ -55,6 +55,8 @@ CHECKED, ROUNDS = 5, 12
 """Steps of descent between two looks at candidates, and looks until others are drawn."""
 FITTED_TO = 1000
 """Demonstrations that a source is fitted to where there is no model."""
+FAR = 100
+"""From so many times its size away on, a workspace has too few places in float32: every half metre in those of UTM."""
 Numbers = ArrayLike | Tensor
 ViaPoint = tuple[float, Numbers]
 Flow = Callable[[Tensor, Tensor], Tensor]
@@ -70,7 +72,8 @@ class Plans:
     """Trajectories and how good they are: feasible ones first, each group from the smoothest on.
 
     Attributes:
-        x: (B, num, T, D) in the user's units, or (num, T, D) for a single pair; likewise below.
+        x: (B, num, T, D) in the user's units, or (num, T, D) for a single pair; likewise below. In float64 where the
+            workspace is `FAR` from the user's origin.
         clearance: the smallest on the way, straight from waypoint to waypoint, over what training keeps and the
             obstacles given, (B, num).
         feasible: nothing is violated on the way, and all of it is inside the workspace; boolean (B, num).
@@ -100,7 +103,9 @@ class Planner:
 
     def __init__(self, model: ConFlow) -> None:
         self.model = model.eval()
-        self.scale, self.offset = (self._each(name, getattr(model.task, name)) for name in ("scale", "offset"))
+        scale, offset = (self._each(name, getattr(model.task, name)) for name in ("scale", "offset"))
+        far = bool((offset.abs() > FAR * scale).any())
+        self.scale, self.offset = (units if far else units.float() for units in (scale, offset))
         self.length, self.origin = model.task.length, model.task.origin
 
     @classmethod
@@ -205,7 +210,7 @@ class Planner:
             u_c = self._descending(discs, index)
             x = in_pieces(lambda x: descend(x, u_c, steps, MOMENTUM), x.flatten(0, 1)).view_as(x)
         plans = self._in_users_units(_ranked(x, Sum(list(met.values()))))
-        plans.x[:, :, index] = y[:, None]  # which on the way through workspace units may have lost a bit
+        plans.x[:, :, index] = y[:, None].to(plans.x)  # which on the way through workspace units may have lost a bit
         return plans if start.ndim == 2 else plans[0]
 
     def best_of(
@@ -257,7 +262,7 @@ class Planner:
             if bool(best.feasible) or passed > seconds:
                 break
         found = sized._in_users_units(best)
-        found.x[:, [0, -1]] = ends
+        found.x[:, [0, -1]] = ends.to(found.x)
         return found
 
     def _sized(self, start: Numbers) -> "Planner":
@@ -286,7 +291,7 @@ class Planner:
     def _each(self, name: str, value: float | Sequence[float]) -> Tensor:
         """A number of the task's for each of D."""
         try:
-            return torch.as_tensor(value, dtype=torch.float32).expand(self.model.D)
+            return torch.as_tensor(value, dtype=torch.float64).expand(self.model.D)
         except RuntimeError:
             expected = f"expected a number, or {self.model.D}, one for each of a configuration"
             raise PlanError(f"task {self.model.task.name}: {name}={brief(value)}: {expected}") from None
@@ -300,8 +305,8 @@ class Planner:
         return bool((self.scale == 1).all()) and not bool(self.offset.any())
 
     def to_workspace(self, x: Tensor) -> Tensor:
-        """Configurations x (..., D) of the user's units in workspace units."""
-        return x if self._in_workspace_units() else (x - self.offset) / self.scale
+        """Configurations x (..., D) of the user's units in workspace units, in float32."""
+        return (x if self._in_workspace_units() else (x - self.offset) / self.scale).float()
 
     def _inside(self, y: Tensor) -> Tensor:
         """Configurations y (..., D) that were checked, in workspace units, and not a bit outside."""
@@ -321,8 +326,8 @@ class Planner:
             if len(ranges) == 1
             else f"{_text(low.tolist())} to {_text(high.tolist())}"
         )
-        # Not a number is not inside either.
-        outside = ~((y >= low) & (y <= high)).all(dim=-1)
+        # In float32, so that what a user computed in it may stand on the border. Not a number is not inside either.
+        outside = ~((y.float() >= low.float()) & (y.float() <= high.float())).all(dim=-1)
         _refuse(name, y, outside, f"expected finite numbers in the workspace {where}")
         return y
 
@@ -333,8 +338,6 @@ class Planner:
     def _disc(self, name: str, disc: Obstacle | Sequence[float]) -> Obstacle:
         """An obstacle in the bodies' units."""
         found = _obstacle(name, disc)
-        if self._in_workspace_units():
-            return found
         x, y = ((value - zero) / self.length for value, zero in zip((found.x, found.y), self.origin, strict=True))
         if isinstance(found, Ball):
             return Ball(x, y, found.radius / self.length, found.z / self.length)
@@ -447,6 +450,9 @@ class DescentPlanner(Planner):
         name = task if isinstance(task, str) else task.name if task.name in TASKS else config.PAPERS_TASK
         given = ["ablation=plus", f"sample.descent={REPAIR_STEPS}", *config.arguments_of(settings)]
         chosen = config.load([f"task={name}", *given])
+        if chosen.data.path is not None:
+            expected = "expected none, without a model the task's own demonstrations are planned from"
+            raise ConfigError(f"data.path={brief(chosen.data.path)}: {expected}")
         made = build_task(chosen) if isinstance(task, str) else of_object(task, chosen)
         if not isinstance(made, SceneTask):
             found = demonstrated(made, FITTED_TO, chosen.data.seed)
@@ -549,14 +555,14 @@ def _of_store(run: str) -> Path:
 
 
 def _numbers(name: str, value: Numbers, expected: str) -> Tensor:
-    """Real numbers in float32."""
+    """Real numbers in float64."""
     try:
         numbers = value.detach().cpu() if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
     except (TypeError, ValueError, RuntimeError):
         raise PlanError(f"{name}={brief(value)}: expected {expected}") from None
     if numbers.dtype == torch.bool or numbers.is_complex():
         raise PlanError(f"{name}={brief(value)}: found {numbers.dtype}, expected {expected}")
-    return numbers.float()
+    return numbers.double()
 
 
 def _refuse(name: str, y: Tensor, refused: Tensor, reason: str) -> None:

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -271,6 +272,7 @@ def test_fitting_the_standard_normal_is_refused() -> None:
     ("arguments", "said"),
     [
         (["correction.at=end", "correction.path=guided"], "correction.path=guided: expected correction.at=point"),
+        (["correction.at=end", "correction.mask=feasible"], "correction.mask=feasible: expected correction.at=point"),
         (["data.negative_share=0.1", "data.negatives=false"], "data.negative_share=0.1: expected data.negatives=true"),
         (["data.repair=true"], "correction.margin=0.0: expected a number above 0 where data.repair=true"),
         (["data.unrepaired=0.3"], "data.unrepaired=0.3: expected data.repair=true"),
@@ -362,6 +364,9 @@ def test_settings_of_swaps_are_refused_for_other_tasks(argument: str, task_file:
         with pytest.raises(ConfigError) as refused:
             config.load([f"task={task}", argument])
         assert str(refused.value) == f"{argument}: expected one of the tasks passing, social, swap, which it belongs to"
+        if argument.startswith("sample."):
+            with pytest.raises(ConfigError, match="^" + re.escape(str(refused.value))):
+                config.override(config.load([f"task={task}"]), [argument], ["sample."])
     config.load(["task=passing", argument])
 
 
@@ -375,7 +380,9 @@ def test_the_tasks_of_two_robots_that_swap_sides_are_those_of_the_scene() -> Non
     [
         ("task.robots=[10, 20,28]", [10, 20, 28]),
         ("task.robots=3", 3),
-        ("task.radius=5e-2", "5e-2"),
+        ("task.radius=5e-2", 0.05),  # which YAML 1.1 takes for a text
+        ("task.radius=[1e-2, +.5E1]", [0.01, 5.0]),
+        ("task.label=e5", "e5"),
         ("task.radius=0.05", 0.05),
         ("task.closed=true", True),
         ("task.label=a b${c}", "a b${c}"),

@@ -14,6 +14,7 @@ from conflow.planner import DescentPlanner, PlanError, Planner
 from conflow.scene.constraint import Barrier, Constraint, RobotAvoidance
 from conflow.scene.crowd import CrowdAvoidance, MapAvoidance
 from conflow.scene.demonstrations import check
+from conflow.scene.errors import DemonstrationError
 from conflow.scene.robots import Crowd, Discs
 from conflow.scene.settings import Box
 from conflow.scene.tasks import CROWDS
@@ -140,6 +141,9 @@ def test_robots_of_circle_swap_with_their_antipodes_nearly() -> None:
 def test_too_many_robots_are_refused() -> None:
     with pytest.raises(ValueError, match=r"robots=300: expected fewer"):
         CROWDS["random"](300).scene(300, 0, 0)
+    with pytest.raises(DemonstrationError, match=r"^robots=64: expected fewer, so many of radius 0.05 find no room$"):
+        CROWDS["weave"](64).demonstrations(2, seed=0)
+    CROWDS["weave"](64, radius=0.01).demonstrations(2, seed=0)
 
 
 @crowds

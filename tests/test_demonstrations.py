@@ -323,6 +323,12 @@ def test_what_cannot_be_had_is_refused(T: int, radius: float) -> None:
         passing(1000, T, radius=radius)
 
 
+def test_people_who_cannot_arrive_are_refused() -> None:
+    """They were drawn for ever."""
+    with pytest.raises(DemonstrationError, match=r"^radius=1\.8: 0 of 1000 pairs arrive inside, expected less$"):
+        social(100, radius=1.8)
+
+
 def test_a_file_is_read_back_to_the_last_bit_and_trained_on(tmp_path: Path) -> None:
     """`load` finds x and no labels, so the experiment computes them: 40 % violate its own threshold."""
     path = tmp_path / "passing.npz"

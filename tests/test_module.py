@@ -223,7 +223,7 @@ def test_many_robots_and_arms_train_on_a_device(task: str) -> None:
     flow = model_of(config.load([f"task={task}", "ablation=plus", "preset=smoke", "source.fit=false"])).to("meta")
     x_1, M = torch.zeros(8, flow.T, flow.D, device="meta"), torch.ones(8, dtype=torch.bool, device="meta")
     assume = _config.patch(meta_nonzero_assume_all_nonzero=True)  # type: ignore[attr-defined]  # "meta" cannot know
-    with assume, OneDevice():
+    with assume, OneDevice():  # type: ignore[no-untyped-call]  # of torch
         results = [flow.loss(x_1, M, None), flow.u_c(x_1)]  # type: ignore[arg-type]
     assert {(result.device.type, result.dtype) for result in results} == {("meta", torch.float32)}
     robots = flow.task.robots

@@ -329,6 +329,32 @@ def test_messages_are_in_the_users_units(changed: dict[str, Any], said: str | No
         planner_in_metres(still=True).plan(**request)
 
 
+def test_plans_far_from_the_users_origin_are_those_near_it() -> None:
+    """In the metres of a map's projection, of which float32 has every half one: plans had steps, and collided."""
+    start, goal = torch.tensor([[-8.3, 0, 8, 0], [8, 0, -8, 0.1]], dtype=torch.float64)
+    near, far = (DescentPlanner.of("swap") for _ in range(2))
+    plans = []
+    for flow, offset in ((near, [0.0] * 4), (far, [5e5, 5.5e6] * 2)):
+        flow.model.task.scale, flow.model.task.offset = 10.0, offset
+        flow = DescentPlanner(flow.model)
+        here = torch.tensor(offset, dtype=torch.float64)
+        for made in (flow.plan(start + here, goal + here, 8), flow.best_of(start + here, goal + here, 8)):
+            plans.append((made, made.x - here))
+            assert torch.equal(plans[-1][0].x[0, 0], start.float() if flow.offset[0] == 0 else start + here)
+    for (made, x), (same, expected) in zip(plans[2:], plans[:2], strict=True):
+        assert made.x.dtype == torch.float64
+        torch.testing.assert_close(x, expected, rtol=0, atol=1e-4)  # metres, of float32 in the workspace
+        torch.testing.assert_close(made.smoothness, same.smoothness)
+        assert torch.equal(made.feasible, same.feasible)
+
+
+def test_an_obstacle_is_in_the_units_of_bodies() -> None:
+    """Which those of configurations need not be."""
+    flow = planner()
+    flow.length = 100.0
+    assert flow._disc("obstacle", (10.0, 0.0, 5.0)) == Obstacle(0.1, 0.0, 0.05)
+
+
 def test_one_offset_for_all_axes_makes_one_range() -> None:
     model = planner().model
     model.task.scale, model.task.offset = 5.0, 5.0
@@ -907,6 +933,11 @@ def test_without_a_model_any_number_of_a_crowd_is_planned_for() -> None:
     assert best.x.shape == (1, 64, 12)
     figure = picture(flow, best)  # of six, not of the 28 that the task has by itself
     assert len([line for line in figure.axes[0].lines if len(line.get_xdata()) == 64]) == 6  # type: ignore[arg-type]
+
+
+def test_without_a_model_a_file_is_refused_and_not_passed_over() -> None:
+    with pytest.raises(ConfigError, match=r"^data\.path=mine\.npz: expected none, without a model"):
+        DescentPlanner.of("swap", data__path="mine.npz")
 
 
 def test_without_a_model_there_is_no_flow_to_guide() -> None:

@@ -1,4 +1,4 @@
-"""What happens around the training loop: logging, progress, and evaluation under the three inference settings."""
+"""What happens around the training loop: logging, progress, and a small sample at validation."""
 
 import signal
 import time

@@ -231,11 +231,16 @@ def load(arguments: Sequence[str] = ()) -> Config:
             _set(settings, key, _multiplied(key, OmegaConf.select(settings, key), factor))
     for key, value in [*flatten(ablation).items(), *pairs]:
         _set(settings, key, value)
-    for key, value in pairs if chosen["task"] not in SWAPS else ():
+    _check_of_swaps(chosen["task"], pairs)
+    return from_tree(_container(settings) | of_task)
+
+
+def _check_of_swaps(task: str, pairs: Sequence[tuple[str, str]]) -> None:
+    """Refuse settings of the swaps where the task is none of them and would not hear of them."""
+    for key, value in pairs if task not in SWAPS else ():
         if key.startswith(OF_SWAPS):
             expected = f"expected one of the tasks {', '.join(SWAPS)}, which it belongs to"
             raise ConfigError(f"{key}={brief(value)}: {expected}")
-    return from_tree(_container(settings) | of_task)
 
 
 def _plain(key: str, text: str) -> Any:
@@ -246,9 +251,16 @@ def _plain(key: str, text: str) -> Any:
         value = yaml.safe_load(text) if re.fullmatch(r"[\w.+-]*|\[[\w.+, -]*\]", text) else text
     except yaml.YAMLError:
         value = text
+    value = [_number(one) for one in value] if isinstance(value, list) else _number(value)
     if isinstance(value, list) and not (all(type(one) in (int, float) for one in value) and len(value) <= MOST_NUMBERS):
         raise ConfigError(f"{brief(key)}={brief(text)}: expected {_describe(list[float])}")
     return value if isinstance(value, bool | int | float | list | None) else text
+
+
+def _number(value: Any) -> Any:
+    """The number of a text such as 1e-5, which YAML 1.1 reads as a number only with a dot and a sign."""
+    number = isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", value)
+    return float(value) if number else value
 
 
 def _factors(file: str, times: Any) -> dict[str, float]:
@@ -349,6 +361,7 @@ def override(config: Config, arguments: Sequence[str], allowed: Sequence[str]) -
         if not key.startswith(tuple(allowed)):
             expected = f"expected settings of {' and '.join(allowed)} only"
             raise ConfigError(f"{key}={brief(value)}: fixed by the run, {expected}")
+    _check_of_swaps(config.task, list(map(split, arguments)))
     return from_tree(_container(settings) | of_task)
 
 
@@ -498,6 +511,9 @@ def _check(config: Config) -> None:
         raise ConfigError("correction.path=guided: expected correction.at=point, the path is guided at its own points")
     if config.correction.at != "end" and config.correction.ramp != 1:
         raise ConfigError(f"correction.ramp={config.correction.ramp}: expected correction.at=end, which it belongs to")
+    if config.correction.at == "end" and config.correction.mask != "violates":
+        expected = "expected correction.at=point, at the end the barrier is its own mask"
+        raise ConfigError(f"correction.mask={config.correction.mask}: {expected}")
     if config.data.negative_share is not None and not config.data.negatives:
         raise ConfigError(f"data.negative_share={config.data.negative_share}: expected data.negatives=true")
     if config.data.repair and not config.correction.margin:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from conflow.scene.constraint import Constraint
 from conflow.scene.crowd import CrowdAvoidance, MapAvoidance
+from conflow.scene.errors import DemonstrationError
 from conflow.scene.robots import Crowd
 from conflow.scene.task import SceneTask, Task
 
@@ -68,6 +69,8 @@ class CrowdTask(SceneTask):
     def scene(self, count: int, seed: int, index: int) -> Tensor:
         made = self.in_scene(count, seed, index)
         start, goal = made.ends(count, np.random.default_rng([*self.name.encode(), count, seed, index]))
+        if min(_closest(start), _closest(goal)) < 2 * made.radius:
+            raise DemonstrationError(f"robots={count}: expected fewer, so many of radius {made.radius} find no room")
         return torch.from_numpy(np.stack([start, goal]).reshape(2, -1)).float()
 
     def demonstrations(self, num: int, seed: int) -> Tensor:
@@ -76,6 +79,12 @@ class CrowdTask(SceneTask):
 
     def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
         return singles(ends, self.T, generator)
+
+
+def _closest(places: np.ndarray) -> float:
+    """The smallest distance between two of places (count, 2)."""
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    return float(apart[np.triu_indices(len(places), 1)].min())
 
 
 def singles(ends: Tensor, T: int, generator: torch.Generator) -> Tensor:

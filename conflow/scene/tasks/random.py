@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from conflow.scene.crowd import MapAvoidance
+from conflow.scene.errors import DemonstrationError
 from conflow.scene.robots import Crowd
 from conflow.scene.routes import routes
 from conflow.scene.tasks.crowd import CrowdTask, singles
@@ -41,7 +42,7 @@ class Random(CrowdTask):
             found = np.vstack([found, place])
             if len(found) == count:
                 return found
-        raise ValueError(f"robots={count}: expected fewer, so many find no room {self.apart} apart")
+        raise DemonstrationError(f"robots={count}: expected fewer, so many find no room {self.apart} apart")
 
     def between(self, ends: Tensor, generator: torch.Generator) -> Tensor:
         """Nearly straight, along the walls where that would leave the square; in a map on a way through it."""

@@ -3,9 +3,13 @@
 import torch
 from torch import Tensor
 
+from conflow.scene.errors import DemonstrationError
 from conflow.scene.tasks.curves import MARGIN, distances, ends, some
 from conflow.scene.tasks.social_force import Robots, walk
 from conflow.scene.tasks.swap import Swap
+
+RARE = 0.01
+"""Of what is drawn at least this share has to be kept."""
 
 
 class Social(Swap):
@@ -22,6 +26,9 @@ def social(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor:
     in 65 % of the trajectories and to the left in the others, but in 10 % one of them misunderstands. With the default
     radius about 38 % collide at a waypoint. Drawn again is what comes within MARGIN of `radius`, leaves the workspace
     or does not arrive. The first n of a seed are the same for every num >= n.
+
+    Raises:
+        DemonstrationError: nearly all is drawn again, since `radius` is too large.
     """
     generator = torch.Generator().manual_seed(seed)
     x = torch.empty(0, T, 4)
@@ -29,7 +36,10 @@ def social(num: int, T: int = 32, seed: int = 0, radius: float = 0.3) -> Tensor:
         drawn, _ = walk(_habits(1000, generator), T, radius)
         inside = (drawn.abs() <= 1).flatten(1).all(dim=1)  # which NaN is not
         clear = (distances(drawn).amin(dim=1) - radius).abs() > MARGIN
-        x = torch.cat([x, drawn[inside & clear].float()])
+        kept = drawn[inside & clear]
+        if len(kept) < RARE * len(drawn):
+            raise DemonstrationError(f"radius={radius}: {len(kept)} of {len(drawn)} pairs arrive inside, expected less")
+        x = torch.cat([x, kept.float()])
     return x[:num]
 
 
