@@ -41,6 +41,8 @@ CONFLOW = $(PYTHON) -m conflow
 TOGETHER = $(if $(filter-out 1,$(DEVICES)),-m torch.distributed.run --standalone --nproc-per-node=$(DEVICES))
 # A task of one's own, which no run holds.
 OWN = $(if $(filter %.py,$(TASK)),task=$(TASK))
+# A variable that was given, of which the command has another default than here.
+GIVEN = $(if $(filter command environment,$(firstword $(origin $(1)))),$(2)=$($(1)))
 WRITTEN = $(if $(OUT),out="$(OUT)") $(if $(NUM),num="$(NUM)")
 
 .DEFAULT_GOAL := help
@@ -81,9 +83,9 @@ explain: .venv/installed  ## Draw why the covariant correction works, and what f
 demonstrations: .venv/installed  ## Write demonstrations for ARGS="data.path=FILE": TASK=passing, or FROM=tracks.csv; OUT= NUM= SEED=
 	@$(CONFLOW) demonstrations $(if $(FROM),from="$(FROM)",task=$(TASK)) $(WRITTEN) seed=$(SEED) $(ARGS)
 
-planbench: .venv/installed  ## Solve scenes of robots or arms: TASK=weave N=28 SCENES=64 RUN=NAME,NAME or none, FORMAT= REFERENCE=1 (published)
-	@$(CONFLOW) planbench task=$(if $(filter-out swap,$(TASK)),$(TASK),weave) n=$(N) scenes=$(SCENES) format=$(FORMAT) \
-	$(if $(REFERENCE),reference=1) $(if $(filter-out latest,$(RUN)),run=$(RUN)) $(ARGS)
+planbench: .venv/installed  ## Solve scenes of robots or arms: TASK=weave N=28 SCENES=64 RUN=NAME,NAME or none, OUT= NUM= SEED= FORMAT= REFERENCE=1 (published)
+	@$(CONFLOW) planbench $(call GIVEN,TASK,task) n=$(N) scenes=$(SCENES) format=$(FORMAT) $(if $(REFERENCE),reference=1) \
+	$(call GIVEN,RUN,run) $(call GIVEN,SEED,seed) $(WRITTEN) $(ARGS)
 
 bench: .venv/installed  ## Measure speed beside other libraries, 6 minutes on an idle machine: FORMAT= REFERENCE=1 (published)
 	@$(PYTHON) -m tests.bench format=$(FORMAT) $(if $(REFERENCE),reference=1)

@@ -206,7 +206,7 @@ def demonstrations(arguments: list[str]) -> None:
     from conflow import commandline
 
     defaults = {"task": "swap", "from": "", "out": "NAME.npz", "num": "3000", "seed": "0"}
-    tracked = {"agents": "2", "seconds": "6", "T": "32", "fps": "", "opposite": "1"}
+    tracked = {"agents": "2", "seconds": "6", "T": "32", "fps": "", "opposite": "1", "near": "2"}
     options, _ = commandline.options(arguments, defaults | tracked, settings=False)
 
     from conflow.demonstrations import from_task, from_tracks

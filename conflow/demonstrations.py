@@ -43,10 +43,12 @@ def from_tracks(options: Mapping[str, str]) -> str:
     opposite = commandline.whole(options, "opposite", 0, 1) == 1
     fps = commandline.number(options, "fps") if options["fps"] else None
     agents, T = commandline.whole(options, "agents", 1, 99), commandline.whole(options, "T", 3, 4096)
-    found = windows.read(options["from"], agents, commandline.number(options, "seconds"), T, fps, opposite)
+    seconds, near = commandline.number(options, "seconds"), commandline.number(options, "near")
+    found = windows.read(options["from"], agents, seconds, T, fps, opposite, near)
     out = _named(options, Path(options["from"]).stem)
     if Path(out) == Path(options["from"]):
         raise ConfigError(f"out={out}: expected another file than from")
     save(out, Demonstrations(found.x, None, found.scale, found.offset.tolist(), found.seconds))
     advice = f"train on it with: make train ABLATION=plus ARGS='data.path={out} constraint.radius=...'"
-    return f"{found.summary}\nWritten: {out}; {advice}"
+    alone = f"train on it with a task of your own: make train TASK=my_task.py ABLATION=plus ARGS='data.path={out}'"
+    return f"{found.summary}\nWritten: {out}; {advice if agents > 1 else alone}"

@@ -405,7 +405,7 @@ def test_the_command_never_overwrites(demonstrations: Typed) -> None:
         ("seed=-1", "seed=-1: expected a whole number of at least 0"),
         (
             "sed=1",
-            "sed: no such option, expected task, from, out, num, seed, agents, seconds, T, fps, opposite; did you",
+            "sed: no such option, expected task, from, out, num, seed, agents, seconds, T, fps, opposite, near; did",
         ),
         ("passing.npz", "passing.npz: expected key=value"),
     ],
@@ -430,6 +430,14 @@ def test_a_bad_command_ends_in_one_line_and_writes_nothing(argument: str, said: 
         (("demonstrations",), ["demonstrations", "task=swap", "seed=0"]),
         (("sample", "OUT=a.npz", "NUM=7"), ["sample", "run=latest", "start=", "goal=", "out=a.npz", "num=7", "seed=0"]),
         (("sample",), ["sample", "run=latest", "start=", "goal=", "seed=0"]),
+        (("planbench",), ["planbench", "n=", "scenes=64", "format=table"]),
+        (
+            ("planbench", "TASK=room", "N=9", "RUN=latest", "SEED=0", "OUT=here", "NUM=4"),
+            [
+                *("planbench", "task=room", "n=9", "scenes=64", "format=table"),
+                *("run=latest", "seed=0", "out=here", "num=4"),
+            ],
+        ),
         (("sample", "RUN=none"), ["sample", "task=swap", "run=none", "start=", "goal=", "seed=0"]),
     ],
 )

@@ -170,6 +170,11 @@ def printed(records: list[Record], form: Format) -> str:
 
 def test_a_record_is_read_as_it_was_written_and_none_is_overwritten(record: Record, tmp_path: Path) -> None:
     paths = [results.write(record, tmp_path / "planbench") for _ in range(2)]
+    paths[0].unlink()  # of which the picture is kept
+    paths[0].with_suffix(".gif").write_text("precious")
+    assert results.write(record, tmp_path / "planbench").stem == f"{paths[0].stem}-3"
+    paths[0].with_suffix(".gif").unlink()
+    assert results.write(record, tmp_path / "planbench") == paths[0]
     assert [path.name for path in paths] == ["weave-8.json", "weave-8-2.json"]
     assert [results.read(path) for path in paths] == [record, record]
     paths[0].write_text("{}")

@@ -8,6 +8,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,6 +63,17 @@ def test_a_password_of_the_server_is_not_printed(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", server.replace("//", "//ada:swordfish@"))
     ui.serve(5000)
     assert capsys.readouterr().out.strip() == address
+
+
+def test_a_password_of_the_store_is_no_argument_of_the_server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Which everybody on the machine could read for as long as it runs."""
+    started: list[Any] = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "execve", lambda *of_it: started.extend(of_it))
+    ui.serve(free_port())
+    _, arguments, environment = started
+    assert "mlflow.db" not in " ".join(arguments)
+    assert environment["MLFLOW_BACKEND_STORE_URI"].endswith("mlflow.db")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")

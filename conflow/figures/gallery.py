@@ -14,7 +14,7 @@ from conflow.figures import curves, workspace
 from conflow.figures.animation import animation
 from conflow.figures.front import front
 from conflow.results import comparison
-from conflow.results.records import Record
+from conflow.results.records import LONGEST, Record
 from conflow.scene.task import Task
 from conflow.tracking import store
 from conflow.training import diagnostics
@@ -30,8 +30,6 @@ TIMES = (0.3, 0.6, 0.9)
 """At which `taken_back` is drawn."""
 COMPARED = 0.6
 """The one of them at which several runs are compared."""
-LONGEST = 200
-"""Characters of a folder's name; systems allow 255 bytes."""
 
 
 def draw(wanted: Sequence[str], split: SplitName, console: Console, task: Task | None = None) -> None:
@@ -101,6 +99,7 @@ def _draw_run(run: Run, split: SplitName, console: Console, task: Task | None) -
     evaluation = sample(model, x_1)
     x_0, ends = evaluation.source_samples, start_and_goal(x_1)
     shares = {t: diagnostics.taken_back(model, x_0, x_1, t) for t in TIMES}
+    along = (NONE, *model.task.settings())  # descent comes after the flow
     pictures: dict[str, Callable[[], Figure]] = {
         "demonstrations": lambda: workspace.demonstrations(data),
         "sources": lambda: workspace.sources(model, evaluation),
@@ -108,7 +107,7 @@ def _draw_run(run: Run, split: SplitName, console: Console, task: Task | None) -
         "flow": lambda: workspace.flow(model, x_0, ends),
         "clearances": lambda: workspace.clearances(model, evaluation),
         "taken_back": lambda: curves.taken_back([(f"t = {t}", share) for t, share in shares.items()]),
-        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in model.settings}),
+        "guidance": lambda: curves.guidance({s: diagnostics.guidance(model, s, x_0, ends) for s in along}),
         "solver_steps": lambda: curves.solver_steps(model, x_0, ends),
         "guidance_weight": lambda: curves.guidance_weight(model, x_0, ends),
     }

@@ -214,7 +214,7 @@ def _nothing(found: _Found, agents: int, seconds: float, near: float, longest: f
         return f"near={near:g}: {there}, but no {agents} of {seconds:g} s come that close in m, expected more"
     if not found.inside:
         return f"seconds={seconds:g}: {there}, all {found.sets} meetings are too near to a track's end, expected less"
-    return f"opposite=True: {there}, in {found.inside} meetings nobody walks in opposite directions, expected False"
+    return f"opposite=1: {there}, in {found.inside} meetings nobody walks in opposite directions, expected 0"
 
 
 def _windows_found(found: _Found, agents: int, seconds: float, near: float, opposite: bool) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from conflow.errors import ConfigError
+from conflow.errors import ConfigError, brief, nearest
 from conflow.results import paper, records
 from conflow.results.claims import Claim, claims
 from conflow.results.records import Record
@@ -51,14 +51,15 @@ def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val"
     Raises:
         ConfigError: there is no such run, or none was measured on this split.
     """
+    if split not in SPLITS:
+        raise ConfigError(f"split={brief(split)}: expected one of {', '.join(SPLITS)}{nearest(split, list(SPLITS))}")
     found = records.from_store(preset, arguments)
     if not found:
         wanted = " ".join([f"preset={preset}", *arguments])
         others = records.others(preset, [])
         there = f"; there are {', '.join(others[:5])}" if others else ""
-        raise ConfigError(
-            f"{wanted}: no such run has finished in {store.place()}{there}; try: make ablations PRESET={preset}"
-        )
+        again = " ".join([f"make ablations PRESET={preset}", *_in_make(arguments)])
+        raise ConfigError(f"{wanted}: no such run has finished in {store.place()}{there}; try: {again}")
     measured = [one.on(split) for one in found if one.measured(split)]
     if not measured:
         raise ConfigError(
@@ -69,6 +70,13 @@ def collect(preset: str, arguments: Sequence[str] = (), split: SplitName = "val"
     rows = _grouped(measured, lambda one: one.ablation)
     of_code = _of_other_code(one for of_row in rows.values() for one in of_row)
     return _comparison(preset, rows, {}, of_code, split, left_out, records.others(preset, found))
+
+
+def _in_make(arguments: Sequence[str]) -> list[str]:
+    """Arguments of `config.load` as variables of make."""
+    tasks = [argument.replace("task=", "TASK=", 1) for argument in arguments if argument.startswith("task=")]
+    others = [argument for argument in arguments if not argument.startswith("task=")]
+    return tasks + [f"ARGS='{' '.join(others)}'"] * bool(others)
 
 
 def collect_reference() -> list[Comparison]:
@@ -153,16 +161,29 @@ def _of_other_code(records: Iterable[Record]) -> str:
 
 
 def _of_different_code(rows: Mapping[str, list[Record]]) -> str:
-    """Which rows of published runs pool several codes; which of them is the present one does not matter."""
+    """Which rows of published runs pool several codes or data; which of them is the present one does not matter."""
+    return "; ".join(
+        said
+        for said in (
+            _differing(rows, "Rows of runs by different code", lambda one: one.origin.get("code_sha", "unknown")),
+            _differing(rows, "Rows of runs on different demonstrations", lambda one: (one.digest or "unknown")[:8]),
+            _differing(rows, "Rows of runs of different task files", lambda one: one.settings.get("task_code", "")),
+        )
+        if said
+    )
+
+
+def _differing(rows: Mapping[str, list[Record]], title: str, of: Callable[[Record], str]) -> str:
+    """Which rows have runs that differ in something, and which seeds have what; nothing where there are none."""
     shown = []
     for name, of_row in rows.items():
         seeds: dict[str, list[str]] = {}
         for one in of_row:
-            seeds.setdefault(one.origin.get("code_sha", "unknown"), []).append(f"s{one.seed}")
+            seeds.setdefault(of(one), []).append(f"s{one.seed}")
         if len(seeds) > 1:
-            several = "; ".join(f"{', '.join(those)}: {sha}" for sha, those in seeds.items())
+            several = "; ".join(f"{', '.join(those)}: {what}" for what, those in seeds.items())
             shown.append(f"{name} ({several})")
-    return f"Rows of runs by different code: {', '.join(shown)}" if shown else ""
+    return f"{title}: {', '.join(shown)}" if shown else ""
 
 
 def _comparison(
@@ -198,9 +219,10 @@ def _reasons(cells: Iterable[Cell]) -> dict[str, str]:
     none, *_ = COLLISIONS.values()
     found: dict[str, str] = {}
     for ablation, row in METHODS.items():
-        differing = {cell.column for cell in cells if cell.row == row and cell.differs}
-        reasons = [paper.UNGUIDED[ablation]] if none in differing and ablation in paper.UNGUIDED else []
-        reasons += [paper.GUIDED] if differing - {none} else []
+        above = {one.column: one.value > (one.paper or 0) for one in cells if one.row == row and one.differs}
+        unguided = (paper.ABOVE if above[none] else paper.BELOW).get(ablation) if none in above else None
+        reasons = [unguided] if unguided else []
+        reasons += [paper.GUIDED] if any(is_above for column, is_above in above.items() if column != none) else []
         if reasons:
             found[row] = "; ".join(reasons)
     return found

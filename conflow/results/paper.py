@@ -15,15 +15,17 @@ TABLE_2 = {
 TRAJECTORIES = 256
 """Of which the paper's rates in Table 1 are the fractions."""
 
-# Why a row differs from the paper's, most likely, and where to see it: without guidance, and guided.
-UNGUIDED = {
+# Why a row is above the paper's or below it without guidance, and above it guided, most likely, and where to see it.
+ABOVE = {
     "cgp": "too short a training: the filter pushes x_t to where the source has no mass (make explain: support), and "
-    "the network learns only late to bring it back; preset long is long enough",
-    "no_negatives": "lower than the paper's: a narrower network at a one-cycle rate may fit D+ more closely",
+    "the network learns to bring it back late, towards the end of preset long",
     "fm": "from a standard normal the ends and the smoothness have to be learned (start error of the Gaussian source "
     "in Table 2), and feasibility with them",
     "fm_mixed": "a model of demonstrations of which 30 % collide cannot give the paper's 0.055 unguided: its cells for "
     "no and for robot guidance look exchanged",
+}
+BELOW = {
+    "no_negatives": "a narrower network at a one-cycle rate may fit D+ more closely than the paper's",
 }
 GUIDED = (
     "guided: the paper does not say where its obstacle stands, and through this one half of the demonstrations pass; a "

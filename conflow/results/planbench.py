@@ -98,11 +98,16 @@ class Record:
     plan: list[list[float]] = field(default_factory=list)
 
 
+PICTURES = (".png", ".gif")
+"""What is drawn beside a record."""
+
+
 def write(record: Record, folder: Path) -> Path:
-    """A new file of this record in a folder, TASK-ROBOTS.json, with a number where that is taken."""
+    """A new file of this record in a folder, TASK-ROBOTS.json, with a number where it or a picture of it is there."""
     folder.mkdir(parents=True, exist_ok=True)
     names = (f"{record.task}-{record.robots}{f'-{i}' if i > 1 else ''}.json" for i in count(1))
-    path = next(folder / name for name in names if not (folder / name).exists())
+    paths = (folder / name for name in names)
+    path = next(path for path in paths if not any(path.with_suffix(kind).exists() for kind in (".json", *PICTURES)))
     path.write_text(json.dumps(asdict(record), indent=1) + "\n")
     return path
 

@@ -1,5 +1,6 @@
 """What is compared of a finished run: read from MLflow, or from a file of record under runs/reference/."""
 
+import hashlib
 import json
 import re
 from collections.abc import Sequence
@@ -16,6 +17,8 @@ from conflow.training.config import OF_TASK, PAPERS_TASK, SPLITS, SplitName, fla
 from conflow.training.evaluation import EVALUATED_ON_VALIDATION
 
 FOLDER = store.RUNS / "reference" / "runs"
+LONGEST = 200
+"""Characters of a name of a file or folder; systems allow 255 bytes."""
 PUBLISHED = ("test/", "validation/", "without_model/", "source/", "evaluate/")
 VALIDATED = {"validation/": "test/", EVALUATED_ON_VALIDATION: "evaluate/"}
 """How metrics of the validation split begin, and those of the test split that they correspond to."""
@@ -110,8 +113,12 @@ class Record:
     def file(self) -> str:
         """The name of the file that it is written to, which says all that `changes` does."""
         parts = [*([] if self.task == PAPERS_TASK else [self.task]), self.ablation, self.preset, *self.changes]
+        said, seed = "-".join(parts), f"-s{self.seed}.json"
         # Letters, digits and what settings are made of; anything else would be no name of a file everywhere.
-        return re.sub(r"[^\w.=+-]+", "_", "-".join([*parts, f"s{self.seed}"])) + ".json"
+        name = re.sub(r"[^\w.=+-]+", "_", said)
+        if len(name) > LONGEST:  # as of many changes, or of old runs where a preset was changed since
+            name = f"{name[:LONGEST]}-{hashlib.sha256(said.encode()).hexdigest()[:8]}"
+        return name + seed
 
     @property
     def digest(self) -> str | None:

@@ -366,7 +366,7 @@ OPTIONS = [
     (("demonstrations", "num=²"), f"num=²: {WHOLE}"),
     (
         ("demonstrations", "sed=1"),
-        "sed: no such option, expected task, from, out, num, seed, agents, seconds, T, fps, opposite",
+        "sed: no such option, expected task, from, out, num, seed, agents, seconds, T, fps, opposite, near",
     ),
     (("demonstrations", "seed\n=x"), f"seed=x: {WHOLE}"),
     (("sample", "goal=0.8,0,-0.8,0"), "start: expected the robots' positions, found none"),
