@@ -19,7 +19,7 @@ from rich.console import Console
 from torch import Tensor
 
 from conflow import commandline
-from conflow.errors import ConfigError
+from conflow.errors import ConfigError, brief
 from conflow.figures.planbench import animation, success
 from conflow.figures.workspace import DPI
 from conflow.orca import Crossing, Simulator
@@ -278,6 +278,15 @@ def _from_line(x: Tensor) -> Tensor:
     return cross.abs() / travel.square().sum(dim=2)
 
 
+def _folder(out: str) -> Path:
+    """The folder for records, made where it is missing."""
+    try:
+        Path(out).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"out={brief(out)}: {error.strerror}, expected a folder") from None
+    return Path(out)
+
+
 def _models(options: Mapping[str, str], arguments: Sequence[str], task: SceneTask, guided: bool) -> dict[str, ConFlow]:
     """The models of the runs that the option `run` names, by what tables call them.
 
@@ -330,10 +339,11 @@ def planbench(options: Mapping[str, str], arguments: Sequence[str], console: Con
     if options["run"] == "none":
         commandline.options(arguments, options, settings=False)  # settings are a model's
     models = {} if options["run"] == "none" else _models(options, arguments, task, guided)
+    folder = _folder(options["out"])  # now, and not when everything is solved
     with ProgressDisplay(console) as display:
         record = run(named, models, robots, scenes, seed, settings, display)
     results.render([record], form, console)
-    path = results.write(record, Path(options["out"]))
+    path = results.write(record, folder)
     attempts = {row.method: (row.seconds, row.passed) for row in record.rows}
     success(record.task, record.robots, attempts).savefig(path.with_suffix(".png"), dpi=DPI)
     if record.plan and isinstance(task, CrowdTask):

@@ -169,12 +169,12 @@ def printed(records: list[Record], form: Format) -> str:
 
 
 def test_a_record_is_read_as_it_was_written_and_none_is_overwritten(record: Record, tmp_path: Path) -> None:
-    paths = [results.write(record, tmp_path / "planbench") for _ in range(2)]
+    paths = [results.write(record, tmp_path) for _ in range(2)]
     paths[0].unlink()  # of which the picture is kept
     paths[0].with_suffix(".gif").write_text("precious")
-    assert results.write(record, tmp_path / "planbench").stem == f"{paths[0].stem}-3"
+    assert results.write(record, tmp_path).stem == f"{paths[0].stem}-3"
     paths[0].with_suffix(".gif").unlink()
-    assert results.write(record, tmp_path / "planbench") == paths[0]
+    assert results.write(record, tmp_path) == paths[0]
     assert [path.name for path in paths] == ["weave-8.json", "weave-8-2.json"]
     assert [results.read(path) for path in paths] == [record, record]
     paths[0].write_text("{}")
@@ -292,6 +292,15 @@ def test_an_option_that_cannot_be_used_is_named(option: str, said: str) -> None:
 def test_without_a_model_an_option_that_is_none_is_named_with_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"^limt: no such option, expected task, .*; did you mean limit\?$"):
         planbench.planbench(asked(), ["limt=20"], Console(quiet=True))
+
+
+def test_a_place_for_records_that_is_none_is_refused_before_anything_is_solved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("precious")
+    with pytest.raises(ConfigError, match=r"^out=file: File exists, expected a folder$"):
+        planbench.planbench(asked(scenes="100000", out="file"), [], Console(quiet=True))
 
 
 def test_models_of_one_name_are_told_apart_by_their_preset_and_the_same_twice_is_refused(

@@ -103,8 +103,7 @@ PICTURES = (".png", ".gif")
 
 
 def write(record: Record, folder: Path) -> Path:
-    """A new file of this record in a folder, TASK-ROBOTS.json, with a number where it or a picture of it is there."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """A new file of this record in a folder that exists: TASK-ROBOTS.json, or numbered where it or its picture does."""
     names = (f"{record.task}-{record.robots}{f'-{i}' if i > 1 else ''}.json" for i in count(1))
     paths = (folder / name for name in names)
     path = next(path for path in paths if not any(path.with_suffix(kind).exists() for kind in (".json", *PICTURES)))
