@@ -317,7 +317,7 @@ def test_that_negatives_help_is_claimed_for_each_reading_that_has_both() -> None
             published(ablation, seed, count + seed, "train.lr=0.1")
         published("cgp", seed, count + seed, "correction.mask=feasible")
     (found,) = comparison.collect_reference()
-    claims = {claim.text: claim for claim in found.claims if claim.text.startswith("negatives help")}
+    claims = {claim.text: claim for claim in found.claims if claim.text.startswith("negatives help ConFlow (")}
     assert len(claims) == 8
     assert claims["negatives help ConFlow (none: robot)"].verdict == "holds"
     reading = claims["negatives help ConFlow (none: robot), constraint.reduction=closest"]

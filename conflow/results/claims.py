@@ -53,6 +53,8 @@ def claims(runs: Mapping[str, list[Record]], readings: Iterable[list[Record]] = 
     ]
     others = [(metric, row) for metric, row in QUALITIES.items() if metric != none]
     ours = [
+        # On D+ alone nothing is corrected, so what it is compared with is the same for every correction.
+        ("negatives help ConFlow with the covariant correction, without guidance", "covariant", "no_negatives", none),
         ("the spectral network lets ConFlow collide less, without guidance", "spectral", "cgp", none),
         ("plus collides less than ConFlow, without guidance", "plus", "cgp", none),
         ("plus collides less than ConFlow (D+), without guidance", "plus", "no_negatives", none),
