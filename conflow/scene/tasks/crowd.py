@@ -69,7 +69,7 @@ class CrowdTask(SceneTask):
     def scene(self, count: int, seed: int, index: int) -> Tensor:
         made = self.in_scene(count, seed, index)
         start, goal = made.ends(count, np.random.default_rng([*self.name.encode(), count, seed, index]))
-        if min(_closest(start), _closest(goal)) < 2 * made.radius:
+        if min(_closest(start), _closest(goal)) < 2 * made.robots.radius:
             raise DemonstrationError(f"robots={count}: expected fewer, so many of radius {made.radius} find no room")
         return torch.from_numpy(np.stack([start, goal]).reshape(2, -1)).float()
 
