@@ -609,7 +609,7 @@ def _obstacle(name: str, value: Obstacle | Sequence[float]) -> Obstacle:
     expected = "an Obstacle or (x, y, radius), in space a Ball or (x, y, z, radius)"
     if isinstance(value, Obstacle):
         value = (value.x, value.y, *([value.z] if isinstance(value, Ball) else []), value.radius)
-    numbers = _numbers(name, value, expected)
+    numbers = _numbers(name, value, expected).float()  # as it is computed with
     if numbers.shape not in ((3,), (4,)):
         raise PlanError(f"{name}={brief(value)}: found shape {tuple(numbers.shape)}, expected {expected}")
     if not bool(numbers.isfinite().all()) or not numbers[-1] > 0:

@@ -580,7 +580,7 @@ REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({"start": {}}, "start={}: expected numbers"),
     ({"start": "☃\n" * 999}, "...: expected numbers"),
     ({"start": (10**400, 0, 0, 0)}, "...: expected numbers"),
-    ({"start": (1e300, 0, 0, 0)}, "start=(inf, 0, 0, 0): expected finite numbers in the workspace"),
+    ({"start": (1e300, 0, 0, 0)}, "start=(1e+300, 0, 0, 0): expected finite numbers in the workspace"),
     ({"start": np.zeros((2, 2, 4))}, "found shape (2, 2, 4), expected"),
     ({"goal": torch.zeros(4, dtype=torch.cfloat)}, "found torch.complex64, expected"),
     ({"goal": torch.full((4,), torch.nan)}, "goal=(nan, nan, nan, nan): expected finite numbers"),
