@@ -22,7 +22,8 @@ class Comparison:
         commands: what makes a row again, by its name.
         reading: how the paper was read, in settings; rows that were read otherwise say so.
         reasons: why rows differ from the paper's, for those that do.
-        code: which runs are of other code than the present or, of published ones, than the others of their row.
+        code: which runs are of other code than the present or, of published ones, of other code or data than the others
+            of their row.
         split: whose starts and goals the models were given; rows without a model are always of the test split.
         left_out: the names of finished runs that were not measured on it.
         others: finished runs at the preset that are of other tasks, data or settings.
@@ -102,7 +103,7 @@ def _of_records(published: Sequence[Record]) -> Comparison:
     changed = [one for one in counted if not one.of_preset]
     readings = _grouped(changed, lambda one: method(one.ablation, [one]))
     readings |= _grouped(beside, lambda one: f"{method(one.ablation, [])}, {' '.join(one.changes)}")
-    found = _comparison(published[0].preset, runs, readings, _of_different_code(runs | readings), "test", [])
+    found = _comparison(published[0].preset, runs, readings, _mixed(runs | readings), "test", [])
     return found if found.task == PAPERS_TASK else _with_task(found)
 
 
@@ -160,7 +161,7 @@ def _of_other_code(records: Iterable[Record]) -> str:
     return f"Trained by other code than the present: {'; '.join(shown)}" if shown else ""
 
 
-def _of_different_code(rows: Mapping[str, list[Record]]) -> str:
+def _mixed(rows: Mapping[str, list[Record]]) -> str:
     """Which rows of published runs pool several codes or data; which of them is the present one does not matter."""
     return "; ".join(
         said
